@@ -1,0 +1,1 @@
+"""From recorded episodes to keyframed LeRobot datasets: recording, keyframing, evaluation and the demo."""
