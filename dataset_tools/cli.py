@@ -1,0 +1,108 @@
+"""The ``histmv`` command: one subcommand per tool, each in a module of its own with a config and ``run(config)``.
+
+A subcommand's module is imported only when it is called, so that ``histmv --help`` is instant.
+"""
+
+import difflib
+import importlib
+import os
+import sys
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import lerobot_histmv
+
+TRACEBACK_VARIABLE = "HISTMV_TRACEBACK"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: the module whose ``run`` does it, and the one line that teaches it."""
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "record": Command(
+        "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
+    ),
+    "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
+    "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
+    "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),
+    "report": Command("dataset_tools.demo_report", "the one-page report of a demo directory, written again"),
+    "configs": Command(
+        "dataset_tools.config_files", "the YAML files for lerobot-train's --config_path, and where they lie"
+    ),
+}
+
+
+def usage() -> str:
+    """What ``histmv --help`` prints."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: histmv COMMAND [--option=value ...]",
+            "",
+            "HistMV for LeRobot: from recorded episodes to a keyframe policy.",
+            "",
+            "commands, in the order in which one needs them:",
+            *lines,
+            "",
+            "histmv COMMAND --help lists a command's options. Training is LeRobot's own:",
+            "  lerobot-train --config_path=$(histmv configs --name=train/default) --dataset.repo_id=... --dataset.root=...",
+        ]
+    )
+
+
+def runner(name: str) -> tuple[Callable[[Any], None], type]:
+    """The ``run`` function of subcommand ``name`` and the config dataclass that it takes."""
+    run = importlib.import_module(COMMANDS[name].module).run
+    hints = typing.get_type_hints(run)
+    hints.pop("return", None)
+    (config_class,) = hints.values()
+    return run, config_class
+
+
+def dispatch(name: str, arguments: Sequence[str]) -> None:
+    """Parse ``arguments`` as subcommand ``name``'s config and run it."""
+    import draccus
+
+    run, config_class = runner(name)
+    run(draccus.parse(config_class, args=list(arguments), prog=f"histmv {name}"))
+
+
+def user_errors() -> tuple[type[Exception], ...]:
+    """Exceptions whose message is written for the user: no traceback is shown for them."""
+    from draccus.utils import DraccusException
+
+    return (ValueError, OSError, DraccusException)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of ``histmv``; exits with 2 for a wrong command line and 1 for a failed run."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(usage())
+        return
+    name, *rest = arguments
+    if name == "--version":
+        print(f"histmv {lerobot_histmv.__version__}")
+        return
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        print(f"histmv: unknown command {name!r}{hint} (commands: {', '.join(COMMANDS)})", file=sys.stderr)
+        sys.exit(2)
+    try:
+        dispatch(name, rest)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except user_errors() as error:
+        if os.environ.get(TRACEBACK_VARIABLE):
+            raise
+        print(f"histmv {name}: {error}\n({TRACEBACK_VARIABLE}=1 shows where this was raised)", file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,56 @@
+"""Every YAML file is one that LeRobot's own parser accepts, and none carries a setting that would break RGB-D training."""
+
+from pathlib import Path
+
+import draccus
+import pytest
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.train import TrainPipelineConfig
+
+import lerobot_policy_histmv  # noqa: F401
+from dataset_tools import config_files
+
+TRAIN = [name for name in config_files.names() if name.startswith("train/")]
+
+
+def load(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> TrainPipelineConfig:
+    """The config as `lerobot-train --config_path=path ...` would see it."""
+
+    @parser.wrap()
+    def capture(cfg: TrainPipelineConfig) -> TrainPipelineConfig:
+        return cfg
+
+    monkeypatch.setattr("sys.argv", ["lerobot-train", f"--config_path={path}", *arguments])
+    return capture()
+
+
+def test_every_yaml_file_is_covered_here() -> None:
+    assert {"train/default", "train/demo", "train/paper"} <= set(TRAIN)
+    assert config_files.names() == TRAIN, "a new kind of config needs a test that loads it"
+
+
+@pytest.mark.parametrize("name", TRAIN)
+def test_lerobot_train_accepts_the_file(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    cfg = load(config_files.find(name), monkeypatch, "--dataset.repo_id=a/b", f"--output_dir={tmp_path / 'new'}")
+    cfg.validate()
+    assert isinstance(cfg.policy, PreTrainedConfig)
+    assert cfg.policy.type == "histmv"
+    assert not cfg.policy.push_to_hub, "training must work without an account"
+    assert cfg.dataset.repo_id == "a/b"
+    assert cfg.dataset.depth_output_unit == "mm"
+    assert not cfg.dataset.image_transforms.enable, "LeRobot's transforms move colour but not depth"
+
+
+def test_the_command_line_wins_over_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = load(config_files.find("train/demo"), monkeypatch, "--steps=7", "--policy.optimizer_lr=0.25")
+    assert cfg.steps == 7
+    assert cfg.policy is not None
+    assert cfg.policy.get_optimizer_preset().lr == 0.25
+
+
+@pytest.mark.parametrize("line", ["stepz: 3", "policy: {type: histmv, optimizer_lrr: 3}"])
+def test_a_misspelt_field_is_refused(line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(f"dataset: {{repo_id: a/b}}\n{line}\n")
+    with pytest.raises(draccus.utils.DecodingError, match="not valid"):
+        load(path, monkeypatch)
