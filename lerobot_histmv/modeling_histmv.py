@@ -1,0 +1,168 @@
+"""The HistMV policy: windows, loss and the memory of past steps around ``HistMVNet``."""
+
+import logging
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Bool, Float, Int
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_histmv import keys
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.data.instructions import load_paraphrases
+from lerobot_histmv.model import augment, losses
+from lerobot_histmv.model.layers import masked_mean
+from lerobot_histmv.model.network import HistMVNet, Observation
+from lerobot_histmv.model.view_attention import choose_views
+from lerobot_histmv.windows import Window, causal_heat, read_window
+
+Batch = dict[str, Any]
+
+
+@dataclass
+class Decision:
+    """What the last decision of a batch of environments looked like, for pictures.
+
+    Args:
+        weights: view weights.
+        view: index of the chosen view.
+        heat: heat map over the chosen view's pixels, sums to 1.
+        surface: expectation of the heat map over the cloud, before the offset [m].
+    """
+
+    weights: Float[Tensor, "b k"]
+    view: Int[Tensor, " b"]
+    heat: Float[Tensor, "b y x"]
+    surface: Float[Tensor, "b 3"]
+
+
+class HistMVPolicy(PreTrainedPolicy):
+    """LeRobot policy ``histmv``: one action is the key pose that the next macro step moves to."""
+
+    config_class = HistMVConfig
+    name = "histmv"
+
+    def __init__(self, config: HistMVConfig, dataset_meta: Any = None, **_: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        if dataset_meta is not None and not config.instructions:
+            config.instructions = load_paraphrases(dataset_meta.root, dataset_meta.tasks.index)
+        self.net = HistMVNet(config.network, config.image_size)
+        ends = [] if dataset_meta is None else dataset_meta.episodes["dataset_to_index"]
+        self.register_buffer("episode_ends", torch.tensor(ends, dtype=torch.long), persistent=False)
+        self._warned: set[str] = set()
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """All trainable parameters."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        """Forget all past steps; call it whenever the environments are reset."""
+        steps = self.config.network.history.past_steps + 1
+        self._fused: deque[Float[Tensor, "b d h w"]] = deque(maxlen=steps)
+        self._tools: deque[Float[Tensor, "b 3"]] = deque(maxlen=steps)
+        self.last_decision: Decision | None = None
+
+    def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Loss over every real step of the windows, each row of the dataset counting once.
+
+        Args:
+            batch: windows of s + 1 rows, old to new, as LeRobot's loader and the preprocessor give them.
+            reduction: "mean" for a scalar, "none" for one loss per window.
+        """
+        config = self.config
+        window = read_window(batch, config.cameras)
+        if self.training:
+            window = self._augment(window)
+        sentences = self._paraphrase(batch["task"]) if self.training else batch["task"]
+        text = self.net.semantics.text(sentences, window.real.device)
+        seen = window.observe(text)
+        choice = config.network.views.train_choice if self.training else "argmax"
+        encoding, predicted, views, shares = self.net(seen, window.real, choice)
+
+        step, view = views.unbind(-1)
+        terms = losses.action_losses(predicted, window.action[step], encoding.cloud[step, view], config.loss)
+        terms = {name: torch.zeros_like(seen.heat[:, 0]).index_add(0, step, shares * term) for name, term in terms.items()}
+        terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
+        weights = losses.term_weights(config.loss)
+        per_step = sum(weights[name] * term for name, term in terms.items())
+        rows = self._row_weights(batch, window.real)
+        log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
+        error = (predicted.position - window.action[step, :3]).norm(dim=-1)
+        log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
+        log |= {f"view_{name}": w.item() for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
+        if reduction == "none":
+            owner = window.real.nonzero()[:, 0]
+            total = torch.zeros(len(window.real), device=per_step.device)
+            return total.index_add(0, owner, per_step * rows) / total.index_add(0, owner, rows), log
+        return masked_mean(per_step, rows), log
+
+    @torch.no_grad()
+    def select_action(self, batch: Batch, **_: Any) -> Float[Tensor, "b 8"]:
+        """Next key pose of each environment: position [m], quaternion wxyz, gripper 1 open or 0 closed."""
+        if self._fused and len(self._fused[0]) != len(batch[keys.STATE]):
+            raise ValueError(
+                f"{len(batch[keys.STATE])} environments, but the memory holds {len(self._fused[0])}: call reset() first"
+            )
+        window = read_window(batch, self.config.cameras)
+        self._tools.append(window.tool)
+        age = torch.arange(len(self._tools) - 1, -1, -1, device=window.tool.device)
+        heat = repeat(causal_heat(age), "p -> b p", b=len(window.tool))
+        text = self.net.semantics.text(self._known(batch["task"]), window.tool.device)
+        seen = window.observe(text, torch.stack(list(self._tools), dim=1), heat)
+        encoding = self.net.encode(seen)
+        self._fused.append(encoding.fused)
+        real = torch.ones(len(window.tool), len(self._fused), dtype=torch.bool, device=window.tool.device)
+        fused = rearrange(torch.stack(list(self._fused), dim=1), "b t d h w -> (b t) d h w")
+        enriched = self.net.remember(fused, text.repeat_interleave(len(self._fused), dim=0), real)
+        views, _ = choose_views(encoding.weights, "argmax")
+        predicted = self.net.decode(encoding, enriched[len(self._fused) - 1 :: len(self._fused)], views)
+        self.last_decision = Decision(encoding.weights, views[:, 1], predicted.log_heat.exp(), predicted.surface)
+        return self._action(predicted.position, predicted.quaternion, predicted.gripper)
+
+    def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Float[Tensor, "b 1 8"]:
+        """A chunk of one key pose."""
+        return rearrange(self.select_action(batch, **kwargs), "b a -> b 1 a")
+
+    def _action(
+        self, position: Float[Tensor, "b 3"], quaternion: Float[Tensor, "b 4"], gripper: Float[Tensor, " b"]
+    ) -> Float[Tensor, "b 8"]:
+        workspace = self.net.workspace
+        position = torch.minimum(torch.maximum(position, workspace.low), workspace.high)
+        canonical = torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+        action = torch.cat([position, canonical, (gripper > 0).to(position.dtype)[:, None]], dim=-1)
+        if not action.isfinite().all():
+            raise ValueError(f"the policy's action is not finite: {action.tolist()}; check the observation for NaN")
+        return action
+
+    def _augment(self, window: Window) -> Window:
+        config = self.config.augment
+        motion, turn = augment.random_world_motion(len(window.real), config, self.net.workspace.centre)
+        return window.moved(motion, turn).distorted(config)
+
+    def _paraphrase(self, sentences: list[str]) -> list[str]:
+        """A random paraphrase of each recorded instruction."""
+        choices = [self.config.instructions.get(sentence, [sentence]) for sentence in sentences]
+        return [options[int(torch.randint(len(options), ()))] for options in choices]
+
+    def _known(self, sentences: list[str]) -> list[str]:
+        """The sentences, with one warning for each that training never saw: it is encoded like any other."""
+        known = {sentence for options in self.config.instructions.values() for sentence in options}
+        for sentence in set(sentences) - known - self._warned:
+            logging.warning("instruction %r was not in the training data; the action relies on similar ones", sentence)
+            self._warned.add(sentence)
+        return sentences
+
+    def _row_weights(self, batch: Batch, real: Bool[Tensor, "b t"]) -> Float[Tensor, " n"]:
+        """One over the number of windows that hold each real row, so that every row counts once per epoch."""
+        if not len(self.episode_ends) or "index" not in batch:
+            return torch.ones(int(real.sum()), device=real.device)
+        age = torch.arange(real.shape[1] - 1, -1, -1, device=real.device)
+        left = self.episode_ends[batch["episode_index"]] - batch["index"]
+        windows = (left[:, None] + age).clamp(max=real.shape[1])
+        return 1 / windows[real]

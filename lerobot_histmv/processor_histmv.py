@@ -1,0 +1,134 @@
+"""Processors of the HistMV policy: what enters is checked, so that no wrong unit or order is trained on silently."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    ProcessorStep,
+    ProcessorStepRegistry,
+    RenameObservationsProcessorStep,
+    TransitionKey,
+    UnnormalizerProcessorStep,
+    policy_action_to_transition,
+    transition_to_policy_action,
+)
+from lerobot.types import EnvTransition
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from torch import Tensor
+
+from lerobot_histmv import keys
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.geometry import UNIT_TOLERANCE
+
+METRE_LIMIT = 20.0
+"""Depth whose largest value lies below this [mm] was surely meant in metres."""
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="histmv_check_input")
+class CheckInputStep(ProcessorStep):
+    """Refuse observations and targets that the policy would silently misread; depth becomes float32 millimetres.
+
+    Args:
+        cameras: the policy's views.
+    """
+
+    cameras: list[str] = field(default_factory=list)
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Check one transition.
+
+        Raises:
+            ValueError: a camera is missing, numbers are not finite, a view has no valid depth at all, depth is in metres,
+                or a quaternion is not unit.
+        """
+        new = transition.copy()
+        observation = dict(new[TransitionKey.OBSERVATION] or {})
+        for camera in self.cameras:
+            for key in (keys.rgb_key(camera), keys.depth_key(camera)):
+                if key not in observation:
+                    raise ValueError(f"observation lacks {key!r}; the policy was trained with the cameras {self.cameras}")
+            key = keys.depth_key(camera)
+            observation[key] = observation[key].to(torch.float32)
+            check_depth(key, observation[key])
+        for key in (keys.STATE, keys.INTRINSICS, keys.EXTRINSICS):
+            if key not in observation:
+                raise ValueError(f"observation lacks {key!r}")
+            check_finite(key, observation[key])
+        check_unit(keys.STATE, observation[keys.STATE])
+        action = new.get(TransitionKey.ACTION)
+        if isinstance(action, Tensor):
+            check_finite(keys.ACTION, action)
+            check_unit(keys.ACTION, action)
+        new[TransitionKey.OBSERVATION] = observation
+        return new
+
+    def get_config(self) -> dict[str, Any]:
+        """What the checkpoint stores."""
+        return {"cameras": self.cameras}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Features stay as they are."""
+        return features
+
+
+def check_finite(key: str, values: Tensor) -> None:
+    """Raise ValueError if ``values`` holds NaN or infinity."""
+    if not torch.isfinite(values).all():
+        raise ValueError(f"{key} holds NaN or infinity; run `histmv doctor` on the dataset or check the sensor")
+
+
+def check_depth(key: str, depth: Tensor) -> None:
+    """Raise ValueError if depth [mm] is not finite, has no valid pixel in some image, or seems to be in metres."""
+    nearest_to_top = depth.flatten(-3).amax(dim=-1)
+    check_finite(key, nearest_to_top)
+    if (nearest_to_top <= 0).any():
+        raise ValueError(f"{key} has an image without any valid depth (all 0); leave the camera out or repair the sensor")
+    if (nearest_to_top < METRE_LIMIT).any():
+        largest = float(nearest_to_top.min())
+        raise ValueError(f"{key} reaches at most {largest:.3g}, which looks like metres; histmv expects millimetres (0 = invalid)")
+
+
+def check_unit(key: str, vectors: Tensor) -> None:
+    """Raise ValueError if the quaternions (components 3 to 6) of ``vectors`` are not unit."""
+    norms = vectors[..., 3:7].norm(dim=-1)
+    if ((norms - 1).abs() > UNIT_TOLERANCE).any():
+        raise ValueError(f"{key} holds a quaternion of norm {float(norms.min()):.3g}; it must be unit, in the order w, x, y, z")
+
+
+def make_histmv_pre_post_processors(
+    config: HistMVConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+) -> tuple[PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]]:
+    """LeRobot's standard steps around ``CheckInputStep``; normalisation is the identity."""
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
+        steps=[
+            RenameObservationsProcessorStep(rename_map={}),
+            AddBatchDimensionProcessorStep(),
+            CheckInputStep(cameras=config.cameras),
+            DeviceProcessorStep(device=str(config.device)),
+            NormalizerProcessorStep(features=features, norm_map=config.normalization_mapping, stats=dataset_stats),
+        ],
+        name=POLICY_PREPROCESSOR_DEFAULT_NAME,
+    )
+    after = PolicyProcessorPipeline[PolicyAction, PolicyAction](
+        steps=[
+            UnnormalizerProcessorStep(
+                features=config.output_features or {}, norm_map=config.normalization_mapping, stats=dataset_stats
+            ),
+            DeviceProcessorStep(device="cpu"),
+        ],
+        name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return before, after

@@ -1,0 +1,113 @@
+"""From LeRobot's batch dictionary to packed tensors: only real rows of each window are kept."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from einops import rearrange, repeat
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lerobot_histmv import keys
+from lerobot_histmv.model import augment
+from lerobot_histmv.model.network import Observation
+
+MILLIMETRE = 1e-3
+HEAT_DECAY = 0.6
+"""Intensity of a tool position in the thermal map relative to the next newer one."""
+
+
+def causal_heat(age: Tensor) -> Tensor:
+    """Intensity of a tool position ``age`` steps ago; 0 for negative ages (the future)."""
+    return torch.where(age >= 0, HEAT_DECAY ** age.clamp_min(0).float(), 0.0)
+
+
+@dataclass
+class Window:
+    """The n real rows of b windows of t rows, packed in row-major order.
+
+    Args:
+        real: which rows are real; the others lie before an episode's start.
+        rgb: colours in [0, 1].
+        depth: distance along the optical axis [m], 0 where invalid.
+        intrinsics: fx, fy, cx, cy [pixels].
+        extrinsics: T_world_cam.
+        tool: measured tool position [m].
+        action: target position [m], quaternion wxyz, gripper; absent at inference.
+    """
+
+    real: Bool[Tensor, "b t"]
+    rgb: Float[Tensor, "n k 3 y x"]
+    depth: Float[Tensor, "n k y x"]
+    intrinsics: Float[Tensor, "n k 4"]
+    extrinsics: Float[Tensor, "n k 3 4"]
+    tool: Float[Tensor, "n 3"]
+    action: Float[Tensor, "n 8"] | None
+
+    def observe(
+        self, text: Float[Tensor, "b c"], tool: Float[Tensor, "n p 3"] | None = None, heat: Float[Tensor, "n p"] | None = None
+    ) -> Observation:
+        """What the network sees; past tool positions come from the window itself unless given."""
+        if tool is None or heat is None:
+            tool, heat = self._past_tools()
+        owner = self.real.nonzero()[:, 0]
+        return Observation(self.rgb, self.depth, self.intrinsics, self.extrinsics, tool, heat, text[owner])
+
+    def _past_tools(self) -> tuple[Float[Tensor, "n t 3"], Float[Tensor, "n t"]]:
+        """Tool positions of each real row's window and their heat at that row: 0 for padding and for the future."""
+        b, t = self.real.shape
+        tools = self.tool.new_zeros(b, t, 3)
+        tools[self.real] = self.tool
+        steps = torch.arange(t, device=self.real.device)
+        heat = causal_heat(steps[:, None] - steps) * self.real[:, None, :]
+        return repeat(tools, "b p c -> b t p c", t=t)[self.real], heat[self.real]
+
+    def moved(self, motion: Float[Tensor, "b 3 4"], turn: Float[Tensor, "b 4"]) -> "Window":
+        """The window after a rigid motion of the world, one per window; ``turn`` is its rotation as a quaternion."""
+        assert self.action is not None
+        owner = self.real.nonzero()[:, 0]
+        each, turns = motion[owner], turn[owner]
+        points = augment.move_points(each, torch.stack([self.tool, self.action[:, :3]], dim=1))
+        rotated = augment.multiply_quaternions(turns, self.action[:, 3:7])
+        return replace(
+            self,
+            extrinsics=augment.move_cameras(each, self.extrinsics[:, None])[:, 0],
+            tool=points[:, 0],
+            action=torch.cat([points[:, 1], rotated, self.action[:, 7:]], dim=-1),
+        )
+
+    def distorted(self, config: augment.AugmentConfig) -> "Window":
+        """The window with shifted, recoloured images and noisy depth."""
+        images = torch.cat([augment.jitter_colours(self.rgb, config), rearrange(self.depth, "n k y x -> n k 1 y x")], dim=2)
+        images, intrinsics = augment.shift_pixels(images, self.intrinsics, config.pixels)
+        depth = augment.noisy_depth(images[:, :, 3], config.depth_noise) if config.depth_noise > 0 else images[:, :, 3]
+        return replace(self, rgb=images[:, :, :3], depth=depth, intrinsics=intrinsics)
+
+
+def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
+    """Pack a batch of windows (training) or of single observations (inference).
+
+    Raises:
+        ValueError: a camera of the policy is missing in the batch.
+    """
+    wanted = [key(camera) for camera in cameras for key in (keys.rgb_key, keys.depth_key)]
+    missing = [key for key in wanted if key not in batch]
+    if missing:
+        raise ValueError(f"observation lacks {missing}; the policy was made for the cameras {cameras}")
+    state = batch[keys.STATE]
+    if state.ndim == 2:
+        real = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
+        pick = lambda values: values  # noqa: E731
+    else:
+        real = ~batch[f"{keys.STATE}_is_pad"] if f"{keys.STATE}_is_pad" in batch else state.new_ones(state.shape[:2]).bool()
+        pick = lambda values: values[real]  # noqa: E731
+    depth = torch.stack([pick(batch[keys.depth_key(camera)]) for camera in cameras], dim=1)
+    return Window(
+        real=real,
+        rgb=torch.stack([pick(batch[keys.rgb_key(camera)]) for camera in cameras], dim=1),
+        depth=MILLIMETRE * rearrange(depth, "n k 1 y x -> n k y x"),
+        intrinsics=rearrange(pick(batch[keys.INTRINSICS]), "n (k c) -> n k c", c=4),
+        extrinsics=rearrange(pick(batch[keys.EXTRINSICS]), "n (k i j) -> n k i j", i=3, j=4),
+        tool=pick(state)[:, :3],
+        action=pick(batch[keys.ACTION]) if keys.ACTION in batch else None,
+    )
