@@ -53,7 +53,7 @@ def usage() -> str:
             *lines,
             "",
             "histmv COMMAND --help lists a command's options. Training is LeRobot's own:",
-            "  lerobot-train --config_path=$(histmv configs --name=train/default) --dataset.repo_id=... --dataset.root=...",
+            "  lerobot-train --config_path=$(histmv configs --name=train/default) --dataset.root=...",
         ]
     )
 

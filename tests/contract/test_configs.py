@@ -1,4 +1,4 @@
-"""Every YAML file is one that LeRobot's own parser accepts, and none carries a setting that would break RGB-D training."""
+"""Every YAML file is one that LeRobot's own parser accepts; none carries a setting that would break RGB-D training."""
 
 from pathlib import Path
 
