@@ -1,0 +1,146 @@
+"""Poses, motions and the blended Cartesian paths between them, in plain numpy.
+
+A motion leads through via points without stopping (its corners are rounded) to a target, where the gripper then acts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from lerobot_histmv.geometry import canonical
+
+TICK = 0.05
+"""Control period [s]: 20 Hz."""
+MAX_SPEED = 0.5
+"""Default peak speed of the tool [m/s]."""
+MAX_TURN_RATE = 2.0
+"""Peak angular speed of the tool [rad/s]."""
+MAX_ACCELERATION = 3.0
+"""Peak acceleration along the path [m/s^2]."""
+BLEND_RADIUS = 0.04
+"""Distance from a via point at which the path leaves the straight line [m]."""
+SAMPLES_PER_SEGMENT = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Pose of the tool (the pinch point between the finger pads, z towards the object) in the base frame.
+
+    Args:
+        position: x, y, z [m], shape (3,).
+        quaternion: w, x, y, z, unit and canonical, shape (4,).
+    """
+
+    position: Float[np.ndarray, " 3"]
+    quaternion: Float[np.ndarray, " 4"]
+
+    def raised(self, height: float) -> "Pose":
+        """The same pose ``height`` [m] further up."""
+        return Pose(self.position + [0, 0, height], self.quaternion)
+
+
+def top_down(position: ArrayLike, yaw: float = 0.0) -> Pose:
+    """Tool pose that points straight down, its fingers apart along the y axis turned by ``yaw`` [rad] about world z."""
+    quaternion = canonical([0.0, np.cos(yaw / 2), np.sin(yaw / 2), 0.0])
+    return Pose(np.asarray(position, dtype=np.float64), quaternion)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an expert does next: pass by ``via`` without stopping, stop at ``target``, then command the gripper.
+
+    Args:
+        via: poses near which the path bends; it comes within about 1.5 cm of them.
+        target: pose at which the arm stops.
+        gripper: command given there, 1 open, 0 closed.
+        speed: peak speed of the tool [m/s].
+        dwell: ticks of ``TICK`` seconds to rest at the end.
+    """
+
+    via: tuple[Pose, ...]
+    target: Pose
+    gripper: float
+    speed: float = MAX_SPEED
+    dwell: int = 2
+
+    def actions(self, gripper_before: float) -> list[Float[np.ndarray, " 8"]]:
+        """The same motion as straight macro steps: one action per via point and one for the target."""
+        steps = [(pose, gripper_before) for pose in self.via] + [(self.target, self.gripper)]
+        return [make_action(pose, gripper) for pose, gripper in steps]
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """One control period about to be simulated.
+
+    Args:
+        action: tool pose commanded for the period's end and the gripper command in force (``keys.POSE_NAMES``), (8,).
+    """
+
+    action: Float[np.ndarray, " 8"] = field(repr=True)
+
+
+def make_action(pose: Pose, gripper: float) -> Float[np.ndarray, " 8"]:
+    """Action vector (``keys.POSE_NAMES``), float32, of a tool pose and a gripper command."""
+    return np.concatenate([pose.position, pose.quaternion, [gripper]]).astype(np.float32)
+
+
+def _smoothstep(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    return u * u * (3 - 2 * u)
+
+
+def _round_corner(
+    positions: Float[np.ndarray, "n 3"], tau: Float[np.ndarray, " n"], corners: Float[np.ndarray, "c 3"], at: int
+) -> None:
+    """Replace the polyline around ``corners[at]`` by a quadratic Bezier curve, in place."""
+    before, after = (np.linalg.norm(corners[at] - corners[at + step]) for step in (-1, 1))
+    radius = min(BLEND_RADIUS, before / 2, after / 2)
+    if radius < 1e-6:
+        return
+    reach_in, reach_out = radius / before, radius / after
+    s = np.where(tau < at, 0.5 + (tau - at) / (2 * reach_in), 0.5 + (tau - at) / (2 * reach_out))
+    near = (s > 0) & (s < 1)
+    s = s[near, None]
+    first = corners[at] + (corners[at - 1] - corners[at]) * reach_in
+    last = corners[at] + (corners[at + 1] - corners[at]) * reach_out
+    positions[near] = (1 - s) ** 2 * first + 2 * s * (1 - s) * corners[at] + s**2 * last
+
+
+def _geometric_path(waypoints: Sequence[Pose]) -> tuple[Float[np.ndarray, "n 3"], Rotation]:
+    """Finely sampled positions and orientations along the rounded polyline; turning eases in and out per segment."""
+    corners = np.array([pose.position for pose in waypoints])
+    turns = Rotation.from_quat([pose.quaternion for pose in waypoints], scalar_first=True)
+    segments = len(waypoints) - 1
+    tau = np.linspace(0, segments, segments * SAMPLES_PER_SEGMENT + 1)
+    index = np.minimum(tau.astype(int), segments - 1)
+    fraction = tau - index
+    positions = corners[index] + fraction[:, None] * (corners[index + 1] - corners[index])
+    for corner in range(1, segments):
+        _round_corner(positions, tau, corners, corner)
+    steps = (turns[1:] * turns[:-1].inv()).as_rotvec()
+    return positions, Rotation.from_rotvec(steps[index] * _smoothstep(fraction)[:, None]) * turns[index]
+
+
+def timed_path(waypoints: Sequence[Pose], speed: float) -> list[Pose]:
+    """Poses at the end of every tick of one smooth motion through ``waypoints`` (the first is where the tool is).
+
+    The motion starts and ends at rest and keeps to ``speed``, ``MAX_TURN_RATE`` and ``MAX_ACCELERATION``.
+    """
+    positions, rotations = _geometric_path(waypoints)
+    moved = np.linalg.norm(np.diff(positions, axis=0), axis=1) / speed
+    turned = (rotations[1:] * rotations[:-1].inv()).magnitude() / MAX_TURN_RATE
+    clock = np.concatenate([[0], np.cumsum(np.maximum(moved, turned))])
+    duration = max(1.5 * clock[-1], np.sqrt(6 * clock[-1] * speed / MAX_ACCELERATION))
+    ticks = max(1, int(np.ceil(duration / TICK)))
+    when = _smoothstep(np.arange(1, ticks + 1) / ticks) * clock[-1]
+    place = np.interp(when, clock, np.arange(len(clock)))
+    low = np.minimum(place.astype(int), len(clock) - 2)
+    share = place - low
+    at = positions[low] + share[:, None] * (positions[low + 1] - positions[low])
+    between = (rotations[low + 1] * rotations[low].inv()).as_rotvec() * share[:, None]
+    quaternions = canonical((Rotation.from_rotvec(between) * rotations[low]).as_quat(scalar_first=True))
+    return [Pose(p, q) for p, q in zip(at, quaternions, strict=True)]

@@ -1,0 +1,92 @@
+"""Pick up the cube that the instruction names and lift it."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_histmv.envs.motion import Motion, top_down
+from lerobot_histmv.envs.tasks.base import COLORS, Task, scatter
+
+if TYPE_CHECKING:
+    from lerobot_histmv.envs.simulation import Simulation
+
+APART = 0.10
+"""Least distance between the cubes' centres [m]."""
+CUBE_HEIGHT = 0.0201
+"""Height [m] of a cube's centre on the table."""
+SUCCESS_HEIGHT = 0.2
+"""The region of success is the space above this height [m] of the cube's centre."""
+ABOVE = 0.12
+"""Height [m] of the via points over the cube."""
+CARRY = (0.42, 0.0, 0.30)
+"""Where the expert brings the cube: over the middle of the workspace."""
+
+TEMPLATES = {
+    "train": (
+        "pick up the {} cube and lift it",
+        "lift the {} cube",
+        "grasp the {} block and raise it",
+        "take the {} cube and hold it up",
+        "grab the {} block and lift it up",
+        "raise the {} cube off the table",
+    ),
+    "held_out": ("hoist the {} block", "get hold of the {} cube and bring it up", "the {} cube should go up in the air"),
+}
+
+
+class PickAndLift(Task):
+    """After RLBench's ``pick_and_lift``. Success: both finger pads touch the target and its centre is above 0.2 m."""
+
+    name = "pick_and_lift"
+    objects = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}
+    variations = tuple((color,) for color in COLORS)
+
+    def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
+        """Cubes at least 10 cm apart, turned by any angle."""
+        for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
+            simulation.place_free(name, (x, y, CUBE_HEIGHT), rng.uniform(-np.pi, np.pi))
+        self._closed = self._gripped_target = self._gripped_other = False
+
+    def watch(self, simulation: "Simulation", gripper: float) -> None:
+        """Remember what has been grasped."""
+        if gripper < 0.5:
+            self._closed = True
+            self._gripped_target |= simulation.gripped(self.targets[0])
+            self._gripped_other |= any(simulation.gripped(name) for name in self.distractors)
+
+    def is_success(self, simulation: "Simulation") -> bool:
+        """Grasped and lifted."""
+        target = self.targets[0]
+        return bool(simulation.position(target)[2] > SUCCESS_HEIGHT) and simulation.gripped(target)
+
+    def failure(self) -> str:
+        """Wrong cube grasped; never closed; closed beside the cube; else held but not lifted in time."""
+        if self._gripped_other:
+            return "wrong object"
+        if self._gripped_target:
+            return "time"
+        return "grasp missed" if self._closed else "not reached"
+
+    def expert(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Down over the cube, grasp, up and over the middle of the workspace."""
+        cube = self.targets[0]
+        grasp = top_down(simulation.position(cube), _nearest_quarter_turn(simulation.yaw(cube)))
+        yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
+        carry = type(grasp)(np.array(CARRY), grasp.quaternion)
+        yield Motion(via=(grasp.raised(ABOVE),), target=carry, gripper=0.0, dwell=4)
+
+    @classmethod
+    def macro_steps(cls, variation: int) -> int:
+        """Above, grasp, above, carry."""
+        return 4
+
+    @classmethod
+    def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
+        """Paraphrases of "pick up the <colour> cube and lift it"."""
+        return tuple(template.format(*cls.variations[variation]) for template in TEMPLATES[split])
+
+
+def _nearest_quarter_turn(yaw: float) -> float:
+    """The equivalent grasp of a cube, turned by less than 45 degrees from the tool's home orientation [rad]."""
+    return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)
