@@ -1,0 +1,158 @@
+"""``histmv record``: the scripted expert of a task demonstrates it; a LeRobot dataset holds one row per frame."""
+
+import importlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dataset_tools.attempts import make_attempts
+from dataset_tools.dense_features import dense_features
+from dataset_tools.record_place import RECORDING_FILE, RecordPlace
+from dataset_tools.record_report import default_root, progress_bar, recording_report, summary_line
+from dataset_tools.record_settings import SEED_LIMIT, RecordSettings
+from dataset_tools.record_worker import WorkerSetup
+from dataset_tools.shards import Outcome, made_attempts, missing_attempts, read_outcomes, write_json
+from lerobot_histmv.envs import TASKS, make
+from lerobot_histmv.envs.ur5 import CAMERA_NAMES
+
+
+@dataclass
+class RecordEnvConfig:
+    """The environment to record, with the flags of LeRobot's ``--env``."""
+
+    # The environment type; only this one has scripted experts.
+    type: str = "ur5"
+    # The task to demonstrate.
+    task: str = ""
+    # Index of the variation to record; by default each episode's seed draws one.
+    variation: int | None = None
+    # Cameras, separated by commas.
+    cameras: str = ",".join(CAMERA_NAMES)
+    # Side of the square images, in pixels.
+    image_size: int = 128
+
+
+@dataclass
+class RecordConfig:
+    """Record successful demonstrations of one task."""
+
+    env: RecordEnvConfig = field(default_factory=RecordEnvConfig)
+    # Successful episodes that the dataset shall hold.
+    episodes: int = 50
+    # Name of the dataset; by default local/ur5_<task>.
+    repo_id: str | None = None
+    # Directory of the dataset; by default $HF_LEROBOT_HOME/<repo_id>.
+    root: str | None = None
+    # Frames per second; must divide the control rate, 20.
+    fps: int = 20
+    # Recording processes.
+    workers: int = 2
+    # Scene seed of the first attempt; attempt i uses seed + i, all below 100000.
+    seed: int = 0
+    # Replace a dataset, or a started recording with other settings, that is in the way.
+    overwrite: bool = False
+
+
+def run(config: RecordConfig) -> None:
+    """Record as ``config`` says, or go on where a killed recording of the same settings stopped.
+
+    Raises:
+        ValueError: a setting is impossible, or something in the way must not be overwritten.
+    """
+    settings = checked_settings(config)
+    repo_id = config.repo_id or f"local/ur5_{settings.task}"
+    make_env = partial(
+        make,
+        settings.task,
+        cameras=settings.cameras,
+        image_size=settings.image_size,
+        variation=settings.variation,
+    )
+    make_env()  # refuses impossible settings; builds nothing yet
+    root = Path(config.root).expanduser() if config.root else default_root(repo_id)
+    recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
+    recorder.record(config.episodes, config.workers)
+
+
+def checked_settings(config: RecordConfig) -> RecordSettings:
+    """The settings in ``config``; ValueError names what is wrong with them."""
+    if config.env.type != "ur5":
+        raise ValueError(f"env.type is {config.env.type!r}; only 'ur5' has scripted experts")
+    if config.env.task not in TASKS:
+        raise ValueError(f"env.task is {config.env.task!r}; accepted is one of {sorted(TASKS)}")
+    for name, value in (("episodes", config.episodes), ("workers", config.workers)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}; it must be at least 1")
+    if config.seed + config.episodes > SEED_LIMIT:
+        raise ValueError(f"seed {config.seed} and {config.episodes} episodes exceed the {SEED_LIMIT} recording seeds")
+    return RecordSettings(
+        task=config.env.task,
+        variation=config.env.variation,
+        cameras=tuple(camera.strip() for camera in config.env.cameras.split(",")),
+        image_size=config.env.image_size,
+        fps=config.fps,
+        seed=config.seed,
+    )
+
+
+class Recorder:
+    """Records one dataset.
+
+    Args:
+        settings: what decides its content.
+        make_env: makes the environment in each worker process; must be picklable.
+        place: where it is recorded.
+        repo_id: its name.
+    """
+
+    def __init__(self, settings: RecordSettings, make_env: Callable[[], Any], place: RecordPlace, repo_id: str) -> None:
+        self._settings, self._make_env, self._place, self._repo_id = settings, make_env, place, repo_id
+        self._console = Console(highlight=False)
+
+    def record(self, episodes: int, workers: int) -> None:
+        """Record until the dataset holds ``episodes`` successes, unless it already does."""
+        finished = self._place.finished(episodes)
+        if finished is None:
+            started = time.monotonic()
+            with self._place.opened() as parts:
+                outcomes = read_outcomes(parts)
+                self._attempt(parts, outcomes, episodes, workers)
+                made = made_attempts(outcomes, episodes)
+                self._place.commit(partial(self._write, parts, made))
+            finished = recording_report(self._settings, made)
+            self._console.print(f"{summary_line(finished)} in {time.monotonic() - started:.0f} s")
+        else:
+            self._console.print(f"already recorded: {summary_line(finished)}")
+        self._console.print(f"dataset {self._repo_id} in {self._place.root}")
+
+    def _attempt(self, parts: Path, outcomes: dict[int, Outcome], episodes: int, workers: int) -> None:
+        setup = WorkerSetup(
+            directory=parts,
+            make_env=self._make_env,
+            cameras=self._settings.cameras,
+            stride=self._settings.stride,
+            seed=self._settings.seed,
+        )
+        # LeRobot takes long to import and is needed only at the end.
+        threading.Thread(target=importlib.import_module, args=("dataset_tools.assembly",), daemon=True).start()
+        with progress_bar(self._console) as progress:
+            kept = episodes - len(missing_attempts(outcomes, episodes))
+            bar = progress.add_task(self._settings.task, total=episodes, completed=kept)
+            for _ in make_attempts(setup, workers, outcomes, episodes):
+                kept = episodes - len(missing_attempts(outcomes, episodes))
+                progress.update(bar, completed=kept)
+            progress.update(bar, completed=episodes)
+
+    def _write(self, parts: Path, made: list[Outcome], root: Path) -> None:
+        from dataset_tools.assembly import assemble
+
+        features = dense_features(self._settings.cameras, self._settings.image_size)
+        kept = [outcome for outcome in made if outcome.success]
+        assemble(parts, kept, features, self._settings.fps, self._repo_id, root)
+        write_json(root / RECORDING_FILE, recording_report(self._settings, made))

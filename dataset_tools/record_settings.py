@@ -1,0 +1,64 @@
+"""What decides a recorded dataset, so that a resumed recording cannot mix two."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_histmv.envs.motion import TICK
+
+CONTROL_RATE = round(1 / TICK)
+"""Ticks per second at which the expert acts."""
+SEED_LIMIT = 100_000
+"""Scenes from this seed on belong to evaluation."""
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """Everything that decides the bytes of the dataset but the number of its episodes.
+
+    Args:
+        task: name of the environment's task.
+        variation: the one to record; None: each seed draws its own.
+        cameras: names, in the order of the calibration vectors.
+        image_size: side of the images [pixels].
+        fps: frames per second; divides ``CONTROL_RATE``.
+        seed: scene seed of the first attempt, below ``SEED_LIMIT``.
+    """
+
+    task: str
+    variation: int | None
+    cameras: tuple[str, ...]
+    image_size: int
+    fps: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        accepted = [rate for rate in range(1, CONTROL_RATE + 1) if CONTROL_RATE % rate == 0]
+        if self.fps not in accepted:
+            raise ValueError(
+                f"fps is {self.fps}; the arm is controlled at {CONTROL_RATE} Hz, so accepted are {accepted}"
+            )
+        if not 0 <= self.seed < SEED_LIMIT:
+            raise ValueError(f"seed is {self.seed}; recordings use scene seeds from 0 to {SEED_LIMIT - 1}")
+
+    @property
+    def stride(self) -> int:
+        """Control ticks per recorded frame."""
+        return CONTROL_RATE // self.fps
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as a JSON file gives it back."""
+        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
+
+    def check_same(self, found: Mapping[str, Any], where: Path, advice: str) -> None:
+        """Raise ValueError if the settings ``found`` at ``where`` are not these."""
+        mine = self.as_json()
+        changes = [
+            f"{name} was {found.get(name)!r} and is now {mine[name]!r}"
+            for name in mine
+            if found.get(name) != mine[name]
+        ]
+        if changes:
+            raise ValueError(f"{where} was recorded with other settings: {', '.join(changes)}; {advice}")

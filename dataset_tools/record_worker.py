@@ -1,0 +1,153 @@
+"""One process that turns scene seeds into finished shards: expert, frames, encoding, statistics.
+
+It imports neither torch nor LeRobot, which would take longer to start than it takes to record some episodes.
+"""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from dataset_tools.dense_features import frame_columns
+from dataset_tools.images import encode_depth, encode_rgb, image_statistics
+from dataset_tools.shards import Outcome, write_failure, write_success
+from lerobot_histmv import keys
+
+_IMAGE_CELL = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+
+
+@dataclass(frozen=True)
+class WorkerSetup:
+    """What a worker must know.
+
+    Args:
+        directory: where shards go.
+        make_env: called once per process; must be picklable.
+        cameras: names, in the order of the calibration vectors.
+        stride: control ticks per recorded frame.
+        seed: scene seed of attempt 0.
+    """
+
+    directory: Path
+    make_env: Callable[[], Any]
+    cameras: tuple[str, ...]
+    stride: int
+    seed: int
+
+
+class Worker:
+    """Makes attempts with one environment, which lives as long as the process."""
+
+    def __init__(self, setup: WorkerSetup) -> None:
+        self.setup = setup
+
+    @cached_property
+    def env(self) -> Any:
+        """The environment, made when first needed, so that what it raises is an attempt's error."""
+        return self.setup.make_env()
+
+    def make_attempt(self, attempt: int) -> Outcome:
+        """Let the expert act in the attempt's scene and commit the shard."""
+        setup, seed = self.setup, self.setup.seed + attempt
+        _, info = self.env.reset(seed=seed)
+        demonstration = Demonstration(self.env, setup.cameras, setup.stride)
+        failure = demonstration.run()
+        outcome = Outcome(
+            attempt=attempt,
+            seed=seed,
+            variation=int(info["variation"]),
+            instruction=info["instruction"],
+            paraphrases=list(self.env.paraphrases),
+            failure=failure,
+            rows=len(demonstration.actions),
+        )
+        if failure:
+            write_failure(setup.directory, outcome)
+            return outcome
+        columns = demonstration.columns()
+        images = {key: column for key, column in columns.items() if key.startswith(keys.IMAGES_PREFIX)}
+        statistics = {key: image_statistics(column) for key, column in images.items()}
+        as_lists = {key: {name: value.tolist() for name, value in s.items()} for key, s in statistics.items()}
+        outcome = dataclasses.replace(outcome, statistics=as_lists)
+        write_success(setup.directory, outcome, episode_table(columns))
+        return outcome
+
+
+class Demonstration:
+    """Frames of one episode in the making.
+
+    With a stride above one, a frame spans several control ticks; its action is the one commanded for their end, so
+    that following the actions at the frame rate leads along the same path.
+    """
+
+    def __init__(self, env: Any, cameras: Sequence[str], stride: int) -> None:
+        self.frames: list[dict[str, np.ndarray]] = []
+        self.actions: list[np.ndarray] = []
+        self._env, self._cameras, self._stride = env, cameras, stride
+        self._ticks = 0
+
+    def run(self) -> str:
+        """Let the expert act; returns why it failed (one of the environment's failure kinds), empty on success."""
+        try:
+            for motion in self._env.expert():
+                self._env.execute(motion, self._on_tick)
+        except ValueError:
+            return "ik"
+        return "" if self._env.is_success() else self._env.stage.task.failure()
+
+    def _on_tick(self, tick: Any) -> None:
+        if self._ticks % self._stride == 0:
+            self.frames.append(frame_columns(self._env.observe(), self._cameras))
+            self.actions.append(tick.action)
+        else:
+            self.actions[-1] = tick.action
+        self._ticks += 1
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All columns, frames stacked along the first axis."""
+        columns = {key: np.stack([frame[key] for frame in self.frames]) for key in self.frames[0]}
+        return columns | {keys.ACTION: np.stack(self.actions).astype(np.float32)}
+
+
+def episode_table(columns: Mapping[str, np.ndarray]) -> pa.Table:
+    """Arrow table of an episode: images as encoded files, vectors as fixed-size lists."""
+    return pa.table({key: _arrow_column(key, column) for key, column in columns.items()})
+
+
+def _arrow_column(key: str, column: np.ndarray) -> pa.Array:
+    if column.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
+    encode, suffix = (encode_depth, "tiff") if key.endswith(keys.DEPTH_SUFFIX) else (encode_rgb, "png")
+    cells = [{"bytes": encode(image), "path": f"frame-{i:06d}.{suffix}"} for i, image in enumerate(column)]
+    return pa.array(cells, type=_IMAGE_CELL)
+
+
+_workers: list[Worker] = []
+
+
+def start_worker(setup: WorkerSetup) -> None:
+    """Initialise a worker process: it ignores Ctrl-C, which its parent handles, and ends when its parent does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _workers[:] = [Worker(setup)]
+
+
+def make_attempt(attempt: int) -> Outcome:
+    """Make an attempt in this worker process."""
+    return _workers[0].make_attempt(attempt)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

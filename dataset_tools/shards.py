@@ -1,0 +1,130 @@
+"""The finished attempts of a recording, one file each: what survives when the recording is killed.
+
+LeRobot's own files have no footer until the whole dataset is finalised, so a kill would lose everything. Here every
+attempt is committed by one rename: ``attempt-000007.parquet`` is a successful episode (its columns, and in the schema
+metadata what the dataset must know about it), ``attempt-000008.json`` says why an attempt failed.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+_OUTCOME = b"histmv.outcome"
+_STEM = "attempt-{:06d}"
+_TEMPORARY = ".tmp"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one attempt.
+
+    Args:
+        attempt: index of the attempt; its scene seed is the recording's seed plus this.
+        failure: why it failed; empty for a success.
+        rows: frames recorded.
+        instruction: the paraphrase drawn for the episode.
+        paraphrases: all instructions of the variation, ``instruction`` among them.
+        statistics: per image column, LeRobot's statistics as nested lists; of a success only.
+    """
+
+    attempt: int
+    seed: int
+    variation: int
+    instruction: str
+    paraphrases: list[str]
+    failure: str
+    rows: int
+    statistics: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def success(self) -> bool:
+        """Whether the episode belongs into the dataset."""
+        return not self.failure
+
+
+def shard_path(directory: Path, attempt: int) -> Path:
+    """Where the episode of a successful attempt lies."""
+    return directory / f"{_STEM.format(attempt)}.parquet"
+
+
+def write_success(directory: Path, outcome: Outcome, table: pa.Table) -> None:
+    """Commit an episode; the file appears whole or not at all."""
+    path = shard_path(directory, outcome.attempt)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
+    header = {_OUTCOME: json.dumps(dataclasses.asdict(outcome)).encode()}
+    pq.write_table(table.replace_schema_metadata(header), temporary, compression="none", use_dictionary=False)
+    temporary.replace(path)
+
+
+def write_failure(directory: Path, outcome: Outcome) -> None:
+    """Commit the news of a failed attempt, so that a resumed recording need not repeat it."""
+    path = directory / f"{_STEM.format(outcome.attempt)}.json"
+    write_json(path, dataclasses.asdict(outcome))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write ``content``; the file appears whole or not at all."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
+    temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
+
+
+def read_outcomes(directory: Path) -> dict[int, Outcome]:
+    """All finished attempts by index. Damaged shards and what killed writers left behind are deleted."""
+    for leftover in directory.glob(f"*{_TEMPORARY}"):
+        leftover.unlink()
+    outcomes = {}
+    for path in sorted([*directory.glob("attempt-*.parquet"), *directory.glob("attempt-*.json")]):
+        try:
+            outcome = _read_outcome(path)
+        except (pa.ArrowInvalid, json.JSONDecodeError):
+            path.unlink()
+        else:
+            outcomes[outcome.attempt] = outcome
+    return outcomes
+
+
+def missing_attempts(outcomes: Mapping[int, Outcome], episodes: int) -> list[int]:
+    """The attempts to make next, if each of them were to succeed.
+
+    The dataset is the first ``episodes`` successes in order of their attempts. Every gap before the last of them must
+    be filled, whoever left it: that makes the result independent of the number of workers and of kills.
+    """
+    missing: list[int] = []
+    successes = 0
+    for attempt in count():
+        if successes + len(missing) >= episodes:
+            break
+        if attempt not in outcomes:
+            missing.append(attempt)
+        elif outcomes[attempt].success:
+            successes += 1
+    return missing
+
+
+def made_attempts(outcomes: Mapping[int, Outcome], episodes: int) -> list[Outcome]:
+    """The attempts up to the one that completed the dataset, in order, failures included.
+
+    Raises:
+        ValueError: the outcomes do not hold ``episodes`` successes without gaps.
+    """
+    if missing := missing_attempts(outcomes, episodes):
+        raise ValueError(f"the recording is not complete: attempts {missing} are missing for {episodes} episodes")
+    made: list[Outcome] = []
+    while sum(outcome.success for outcome in made) < episodes:
+        made.append(outcomes[len(made)])
+    return made
+
+
+def _read_outcome(path: Path) -> Outcome:
+    if path.suffix == ".json":
+        return Outcome(**json.loads(path.read_text(encoding="utf-8")))
+    return Outcome(**json.loads(pq.read_schema(path).metadata[_OUTCOME]))
