@@ -1,0 +1,113 @@
+"""Push the buttons that the instruction names, in its order."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_histmv.envs.motion import Motion, top_down
+from lerobot_histmv.envs.tasks.base import Task, scatter
+
+if TYPE_CHECKING:
+    from lerobot_histmv.envs.simulation import Simulation
+
+APART = 0.14
+"""Least distance between the buttons' centres [m]."""
+PRESSED = -0.003
+"""A button counts as pressed once its cap is this far down [m], as in RLBench."""
+CAP_TOP = 0.042
+"""Height [m] of an unpressed cap's top."""
+PUSH_HEIGHT = 0.032
+"""Height [m] of the tool when the expert pushes."""
+ABOVE = 0.14
+"""Height [m] of the via point over a button."""
+
+TEMPLATES = {
+    "train": (
+        ("push the {} button", ", then the {} one"),
+        ("press the {} button", ", then press the {} button"),
+        ("push down the {} button", " and after that the {} button"),
+        ("hit the {} button", ", next hit the {} button"),
+        ("touch and press the {} button", ", followed by the {} button"),
+        ("click the {} button", ", then click the {} one"),
+    ),
+    "held_out": (
+        ("tap the {} button", " and afterwards tap the {} button"),
+        ("the {} button has to be pushed", ", and then the {} one"),
+        ("activate the {} button", ", subsequently the {} button"),
+    ),
+}
+"""How a sentence begins, and how each further button is added to it."""
+
+
+class PushButtons(Task):
+    """After RLBench's ``push_buttons``. Success: the named buttons were pressed in the named order, and no other button.
+
+    The arm starts with its gripper closed, which is its pushing tool. A pressed button springs back and looks as before.
+    """
+
+    name = "push_buttons"
+    objects = {"button0": "button", "button1": "button", "button2": "button"}
+    initial_gripper = 0.0
+    variations = (
+        ("red",),
+        ("green",),
+        ("blue",),
+        ("yellow",),
+        ("purple",),
+        ("cyan",),
+        ("red", "green"),
+        ("green", "yellow"),
+        ("blue", "cyan"),
+        ("yellow", "purple"),
+        ("purple", "red"),
+        ("cyan", "blue"),
+        ("red", "blue", "green"),
+        ("green", "cyan", "red"),
+        ("blue", "red", "yellow"),
+        ("yellow", "green", "purple"),
+        ("purple", "yellow", "cyan"),
+        ("cyan", "purple", "blue"),
+    )
+
+    def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
+        """Buttons at least 14 cm apart."""
+        for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
+            simulation.place_fixed(name, (x, y, 0))
+        self._pressed: list[str] = []
+
+    def watch(self, simulation: "Simulation", gripper: float) -> None:
+        """Note each press; pressing the same button again changes nothing."""
+        for name in self.slots:
+            if simulation.slide(name) < PRESSED and self._pressed[-1:] != [name]:
+                self._pressed.append(name)
+
+    def is_success(self, simulation: "Simulation") -> bool:
+        """The named buttons, in order, and none other."""
+        return self._pressed == self.targets
+
+    def failure(self) -> str:
+        """Another button, or a named one out of turn, was pressed; none was pressed; or not all of them in time."""
+        if self._pressed != self.targets[: len(self._pressed)]:
+            return "wrong object"
+        return "time" if self._pressed else "not reached"
+
+    def expert(self, simulation: "Simulation") -> Iterator[Motion]:
+        """For each button: over it without stopping, then down to the push."""
+        for name in self.targets:
+            x, y, _ = simulation.position(name)
+            yield Motion(via=(top_down((x, y, ABOVE)),), target=top_down((x, y, PUSH_HEIGHT)), gripper=0.0, dwell=4)
+
+    @classmethod
+    def macro_steps(cls, variation: int) -> int:
+        """Above and push, for each named button."""
+        return 2 * len(cls.variations[variation])
+
+    @classmethod
+    def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
+        """Paraphrases of "push the <colour> button, then the <colour> one"."""
+        first, *others = cls.variations[variation]
+        return tuple(
+            start.format(first) + "".join(addition.format(color) for color in others)
+            for start, addition in TEMPLATES[split]
+        )
