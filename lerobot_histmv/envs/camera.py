@@ -57,7 +57,8 @@ class Renderer:
         self._view.fixedcamid = self._model.camera(CAMERAS[camera]).id
         category = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, category, self._scene)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_HAZE, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = 0
         viewport = mujoco.MjrRect(0, 0, side, side)
         mujoco.mjr_render(viewport, self._scene, self._mjr)
         color = np.empty((side, side, 3), np.uint8)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 APART = 0.12
 """Least horizontal distance between the spheres' centres [m]."""
-HEIGHTS = (0.08, 0.30)
+HEIGHTS = (0.05, 0.20)
 """Range of the spheres' heights [m]."""
 REACHED = 0.02
 """The target is reached when the tool is this close to its centre [m]; also the spheres' radius."""
@@ -41,7 +41,7 @@ class ReachTarget(Task):
     variations = tuple((color,) for color in COLORS)
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
-        """Spheres at least 12 cm apart on the ground plan, 8 to 30 cm above the table."""
+        """Spheres at least 12 cm apart on the ground plan, 5 to 20 cm above the table."""
         for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
             simulation.place_fixed(name, (x, y, rng.uniform(*HEIGHTS)))
         self._touched_other = False
