@@ -1,0 +1,154 @@
+"""The demo's pictures: the loss curve from LeRobot's training log, and a contact sheet of one keyframed episode."""
+
+import io
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.dataset
+from jaxtyping import UInt8, UInt16
+from matplotlib.figure import Figure
+from PIL import Image
+
+from lerobot_histmv import keys
+
+LOG_FREQUENCY = re.compile(r"'log_freq': (\d+)")
+LOSS = re.compile(r"\bstep:\S+ .*?\bloss:([-+.\deE]+|nan|inf)")
+CHECKPOINT = re.compile(r"Checkpoint policy after step (\d+)")
+START = "Start offline training"
+
+DEPTH_SHOWN = (300.0, 1500.0)
+"""Range of the depth pictures [mm]."""
+
+
+@dataclass(frozen=True)
+class LossHistory:
+    """Training loss (mean over each logging period) and the steps at which it was logged."""
+
+    steps: list[int]
+    losses: list[float]
+
+
+def read_losses(lines: Iterable[str]) -> LossHistory:
+    """The loss curve in ``lerobot-train``'s output; runs that were continued are joined at the checkpoint.
+
+    LeRobot prints steps above 999 rounded to thousands, so steps are counted from the logging period and the
+    checkpoints, whose numbers are exact.
+    """
+    period, step, checkpoint = 1, 0, 0
+    found: dict[int, float] = {}
+    for line in lines:
+        if match := LOG_FREQUENCY.search(line):
+            period = int(match[1])
+        elif START in line:
+            step = checkpoint - checkpoint % period
+        elif match := CHECKPOINT.search(line):
+            checkpoint = int(match[1])
+        elif match := LOSS.search(line):
+            step += period
+            found[step] = float(match[1])
+    return LossHistory(sorted(found), [found[step] for step in sorted(found)])
+
+
+def draw_losses(history: LossHistory, path: Path) -> None:
+    """Write the loss curve as a picture."""
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(history.steps, history.losses, color="tab:blue", linewidth=1.5)
+    if history.losses and min(history.losses) > 0:
+        axes.set_yscale("log")
+    axes.set_xlabel("training step")
+    axes.set_ylabel("loss")
+    axes.grid(alpha=0.3, which="both")
+    figure.savefig(path, dpi=110)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One row of a keyframed dataset, ready to be shown.
+
+    Args:
+        pictures: camera -> colours (h, w, 3) and depth [mm] (h, w) or None.
+        reason: why the observed keyframe was kept.
+        seconds: its time in the recorded episode.
+        instruction: the task's text.
+    """
+
+    pictures: dict[str, tuple[UInt8[np.ndarray, "h w 3"], UInt16[np.ndarray, "h w"] | None]]
+    reason: str
+    seconds: float
+    instruction: str
+
+
+def read_keyframes(root: Path, episode: int) -> list[Keyframe]:
+    """Rows of one episode of a keyframed dataset, read without LeRobot.
+
+    Raises:
+        ValueError: the dataset has no such episode.
+    """
+    features = json.loads((root / "meta" / "info.json").read_text())["features"]
+    cameras = [
+        key.removeprefix(keys.IMAGES_PREFIX)
+        for key in features
+        if key.startswith(keys.IMAGES_PREFIX) and not key.endswith(keys.DEPTH_SUFFIX)
+    ]
+    table = pyarrow.dataset.dataset(root / "data", format="parquet")
+    rows = table.to_table(filter=pyarrow.dataset.field("episode_index") == episode).to_pylist()
+    if not rows:
+        raise ValueError(f"{root} has no episode {episode}")
+    tasks = pyarrow.dataset.dataset(root / "meta" / "tasks.parquet").to_table().to_pandas()
+    instructions = dict(zip(tasks["task_index"], tasks.index, strict=True))
+    return [
+        Keyframe(
+            pictures={camera: (image(row[keys.rgb_key(camera)]), depth_of(row, camera)) for camera in cameras},
+            reason=keys.REASONS[scalar(row[keys.REASON])],
+            seconds=float(scalar(row[keys.SOURCE_TIMESTAMP])),
+            instruction=str(instructions[row["task_index"]]),
+        )
+        for row in sorted(rows, key=lambda row: row["frame_index"])
+    ]
+
+
+def image(stored: dict[str, Any]) -> np.ndarray:
+    """The pixels of an image column's value."""
+    return np.asarray(Image.open(io.BytesIO(stored["bytes"])))
+
+
+def depth_of(row: dict[str, Any], camera: str) -> UInt16[np.ndarray, "h w"] | None:
+    """Depth [mm] of ``camera``, if the dataset has any."""
+    stored = row.get(keys.depth_key(camera))
+    return None if stored is None else image(stored).astype(np.uint16)
+
+
+def scalar(value: Any) -> Any:
+    """The number in a feature of shape (1,), which is stored as a list or as itself."""
+    return value[0] if isinstance(value, list) else value
+
+
+def draw_contact_sheet(keyframes: list[Keyframe], path: Path) -> None:
+    """Write one episode as a picture: a row per macro step, colours and depth of each camera side by side."""
+    panels = [
+        [(f"{camera}{' depth' if is_depth else ''}", pixels) for camera, pair in frame.pictures.items()
+         for is_depth, pixels in enumerate(pair) if pixels is not None]
+        for frame in keyframes
+    ]  # fmt: skip
+    rows, columns = len(panels), len(panels[0])
+    figure = Figure(figsize=(1.5 * columns + 0.9, 1.5 * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for frame, line, axes_of_row in zip(keyframes, panels, grid, strict=True):
+        for (name, pixels), axes in zip(line, axes_of_row, strict=True):
+            if pixels.ndim == 3:
+                axes.imshow(pixels)
+            else:
+                axes.imshow(np.ma.masked_equal(pixels, 0), cmap="viridis", vmin=DEPTH_SHOWN[0], vmax=DEPTH_SHOWN[1])
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if frame is keyframes[0]:
+                axes.set_title(name, fontsize=9)
+        axes_of_row[0].set_ylabel(f"{frame.reason}\n{frame.seconds:.2f} s", fontsize=9)
+    figure.suptitle(f"“{keyframes[0].instruction}”", fontsize=11)
+    figure.savefig(path, dpi=110)
