@@ -1,0 +1,186 @@
+"""Guessing a dataset's tool position, rotation and gripper columns from feature names.
+
+Nothing is guessed where the names leave a choice: that is an error which lists the candidates and the option to set.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Callable
+
+from dataset_tools.columns import (
+    NONE,
+    ROTATION_FORMATS,
+    Column,
+    Columns,
+    ColumnsConfig,
+    Features,
+    entry_names,
+    listing,
+    parse,
+    vectors,
+)
+from lerobot_histmv import keys
+
+_TOOL = {"ee", "eef", "tcp", "tool", "effector", "hand", "gripper", "cartesian"}
+_NOT_A_POSE = {
+    "vel",
+    "velocity",
+    "speed",
+    "acc",
+    "force",
+    "torque",
+    "effort",
+    "goal",
+    "target",
+    "object",
+    "obj",
+    "delta",
+}
+_ROTATION = {"quat", "quaternion", "rot", "rotation", "orientation", "ori", "orn", "euler", "axis", "angle", "rotvec"}
+_GRIPPER = {"gripper", "grip", "jaw", "finger", "fingers"}
+_ROTATION_AXES = (
+    ("wxyz", ("qw", "qx", "qy", "qz"), None),
+    ("wxyz", ("w", "x", "y", "z"), _ROTATION),
+    ("rotvec", ("wx", "wy", "wz"), None),
+    ("rpy", ("roll", "pitch", "yaw"), None),
+)
+"""Rotation format, names of its entries, and the words of which one must stand beside them."""
+
+
+def resolve(features: Features, config: ColumnsConfig) -> Columns:
+    """Columns as configured, the others guessed.
+
+    Raises:
+        ValueError: a column that is not in the dataset, several candidates, no tool position and no joints given, a
+            rotation whose format neither names nor configuration tell.
+    """
+    gripper = _gripper(features, config)
+    ends = _gripper_range(features, gripper, config)
+    if config.joints:
+        return Columns(parse(features, config.joints, "joints"), True, None, "", gripper, ends)
+    curve = parse(features, config.position, "position") if config.position else _position(features)
+    if len(curve.indices) != 3:
+        raise ValueError(f"columns.position is {curve}, {len(curve.indices)} entries; it must be x, y, z")
+    return Columns(curve, False, *_rotation(features, config, curve.feature), gripper, ends)
+
+
+def _position(features: Features) -> Column:
+    found = _by_axes(features, ("x", "y", "z"), lambda tokens: not tokens & (_NOT_A_POSE | _ROTATION))
+    found += _by_axes(features, ("px", "py", "pz"), lambda tokens: not tokens & _NOT_A_POSE)
+    found = [column for column in found if column.feature != keys.ACTION]
+    found += [
+        Column(key, (0, 1, 2))
+        for key, names in vectors(features).items()
+        if not names
+        and features[key]["shape"][0] >= 3
+        and _tokens(key) & _TOOL
+        and _tokens(key) & {"pos", "pose", "position"}
+    ]
+    found = _first_feature([column for column in found if _tokens(str(column)) & _TOOL] or found, keys.STATE)
+    if not found:
+        raise ValueError(
+            f"no tool position found in {listing(features)}; give --columns.position=feature:start:stop, or follow the "
+            "joint angles instead with --columns.joints=feature:start:stop (--epsilon then counts in radians)"
+        )
+    return _only(found, "position")
+
+
+def _rotation(features: Features, config: ColumnsConfig, near: str) -> tuple[Column | None, str]:
+    """Rotation column and its format; guesses come only from the feature ``near`` that holds the position."""
+    if config.rotation == NONE:
+        return None, ""
+    if config.rotation:
+        return _told_rotation(features, config.rotation, config.rotation_format)
+    for rotation_format, axes, words in _ROTATION_AXES:
+        found = _by_axes(
+            {near: features[near]}, axes, lambda tokens, words=words: words is None or bool(tokens & words)
+        )
+        if found:
+            return _only(found, "rotation"), rotation_format
+    return None, ""
+
+
+def _told_rotation(features: Features, text: str, rotation_format: str | None) -> tuple[Column, str]:
+    column = parse(features, text, "rotation")
+    if rotation_format is None:
+        named = _by_axes({column.feature: features[column.feature]}, ("qw", "qx", "qy", "qz"), lambda _: True)
+        if not any(set(candidate.indices) == set(column.indices) for candidate in named):
+            raise ValueError(
+                f"columns.rotation is {column}; its names do not tell the order, so give --columns.rotation_format="
+                f"{', '.join(ROTATION_FORMATS)}"
+            )
+        column, rotation_format = next(c for c in named if set(c.indices) == set(column.indices)), "wxyz"
+    if len(column.indices) != ROTATION_FORMATS[rotation_format]:
+        raise ValueError(
+            f"columns.rotation is {column}, {len(column.indices)} entries; {rotation_format} has "
+            f"{ROTATION_FORMATS[rotation_format]}"
+        )
+    return column, rotation_format
+
+
+def _gripper(features: Features, config: ColumnsConfig) -> Column | None:
+    if config.gripper == NONE:
+        return None
+    if config.gripper:
+        column = parse(features, config.gripper, "gripper")
+        if len(column.indices) != 1:
+            raise ValueError(f"columns.gripper is {column}, {len(column.indices)} entries; it must be one")
+        return column
+    found = []
+    for key, names in sorted(vectors(features).items(), key=lambda item: item[0] != keys.STATE):
+        if features[key]["shape"][0] == 1 and _tokens(key) & _GRIPPER:
+            found.append(Column(key, (0,), names))
+        else:
+            found += [Column(key, (i,), (name,)) for i, name in enumerate(names) if _is_gripper(name)]
+    found = _first_feature(found, keys.ACTION)
+    return _only(found, "gripper") if found else None
+
+
+def _gripper_range(features: Features, gripper: Column | None, config: ColumnsConfig) -> tuple[float, float] | None:
+    """Closed and open: as told; 0 and 1 where the gripper stands among our own pose names."""
+    if config.gripper_range is not None:
+        closed, opened = config.gripper_range
+        return closed, opened
+    if gripper and set(keys.POSE_NAMES) <= set(entry_names(features[gripper.feature])):
+        return 0.0, 1.0
+    return None
+
+
+def _is_gripper(name: str) -> bool:
+    tokens = _tokens(name)
+    return bool(tokens & _GRIPPER) and not tokens & (_NOT_A_POSE | _ROTATION | {"x", "y", "z"})
+
+
+def _by_axes(features: Features, axes: tuple[str, ...], fits: Callable[[set[str]], bool]) -> list[Column]:
+    """Sets of entries whose names differ in nothing but the axis, e.g. tcp_x, tcp_y, tcp_z."""
+    found = []
+    for key, names in vectors(features).items():
+        groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
+        for i, name in enumerate(names):
+            tokens = re.split(r"[^a-z0-9]+", name.lower())
+            for axis in set(tokens) & set(axes):
+                groups[tuple("*" if token == axis else token for token in tokens)][axis] = i
+        for group, entries in groups.items():
+            if set(entries) == set(axes) and fits(set(group) | _tokens(key)):
+                indices = tuple(entries[axis] for axis in axes)
+                found.append(Column(key, indices, tuple(names[i] for i in indices)))
+    return found
+
+
+def _tokens(text: str) -> set[str]:
+    return set(re.split(r"[^a-z0-9]+", text.lower()))
+
+
+def _first_feature(found: list[Column], preferred: str) -> list[Column]:
+    """Candidates of the ``preferred`` feature if it has any, else of the first feature that has."""
+    features = [column.feature for column in found]
+    first = preferred if preferred in features else next(iter(features), None)
+    return [column for column in found if column.feature == first]
+
+
+def _only(found: list[Column], option: str) -> Column:
+    if len(found) > 1:
+        raise ValueError(
+            f"several columns may be the {option}: {' or '.join(map(str, found))}; choose with --columns.{option}=..."
+        )
+    return found[0]

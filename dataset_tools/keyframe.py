@@ -1,0 +1,141 @@
+"""``histmv keyframe``: from a dense LeRobot dataset to one with a row per macro step."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from dataset_tools import build
+from dataset_tools.column_guesses import resolve
+from dataset_tools.columns import ColumnsConfig
+from dataset_tools.fitness import Distance
+from dataset_tools.genetic import GeneticOptions
+from dataset_tools.keyframes import MOST, KeyframeOptions, extract
+from dataset_tools.missing import notices
+from dataset_tools.report import Report
+from dataset_tools.shards import write_json
+from dataset_tools.signals import PauseOptions
+from dataset_tools.simplify import Method
+from dataset_tools.source import open_source
+from dataset_tools.trajectories import gripper_ends, read_vectors, trajectory_of
+from lerobot_histmv import keys
+
+
+@dataclass
+class SourceConfig:
+    """The dense dataset to read."""
+
+    # Name, such as user/demonstrations. Without a root it is looked for locally, then on the Hub, as LeRobot does.
+    repo_id: str
+    # Folder that holds the dataset.
+    root: Path | None = None
+    # Episodes to use, e.g. [0,1,5]; all by default.
+    episodes: list[int] | None = None
+    # Branch, tag or commit on the Hub.
+    revision: str | None = None
+
+
+@dataclass
+class OutputConfig:
+    """The keyframed dataset to write."""
+
+    # Name of the new dataset, such as user/demonstrations_keyframed.
+    repo_id: str
+    # Folder to write; by default LeRobot's own place for this repo_id.
+    root: Path | None = None
+    # Upload it when done.
+    push_to_hub: bool = False
+    # Upload it as a private repository.
+    private: bool = False
+
+
+@dataclass
+class KeyframeConfig:
+    """Keep the key poses of each episode: one row per macro step, with the next key pose as the action.
+
+    Always kept are the first and last frame, pauses and gripper changes; between them the method adds the fewest poses
+    such that straight lines between key poses stay within epsilon of the recorded path on average.
+
+        histmv keyframe --dataset.repo_id=me/demos --dataset.root=demos --output.repo_id=me/keys --output.root=keys
+
+    Any LeRobot dataset works; where the tool position, rotation and gripper cannot be guessed from the feature names,
+    tell them: --columns.position=observation.state:0:3 --columns.gripper=action:6
+    """
+
+    dataset: SourceConfig
+    output: OutputConfig
+    columns: ColumnsConfig = field(default_factory=ColumnsConfig)
+    # ga (genetic), exact (dynamic program), heuristic (pauses and gripper only), rdp, awe (fewest under a largest
+    # error) or uniform (evenly in time).
+    method: Method = "ga"
+    # Accepted mean distance of moving frames to the straight lines [m]; for awe the largest distance of any frame.
+    epsilon: float = 0.005
+    # segment: distance to the piece between two key poses. line: to the infinite line, Eq. 1 of the paper as printed.
+    distance: Distance = "segment"
+    # Metres that one radian of rotation counts as; 0 ignores rotation, as the paper does.
+    rotation_scale: float = 0.0
+    # The same seed and data give the same key poses.
+    seed: int = 0
+    # Key poses per episode at most, unless more are mandatory.
+    most: int = MOST
+    # What counts as a pause.
+    pause: PauseOptions = field(default_factory=PauseOptions)
+    # Settings of the genetic algorithm.
+    genetic: GeneticOptions = field(default_factory=GeneticOptions)
+    # Replace an existing output dataset.
+    overwrite: bool = False
+
+    def options(self) -> KeyframeOptions:
+        """The part that decides which frames are kept."""
+        return KeyframeOptions(
+            method=self.method,
+            epsilon=self.epsilon,
+            distance=self.distance,
+            rotation_scale=self.rotation_scale,
+            seed=self.seed,
+            most=self.most,
+            pause=self.pause,
+            genetic=self.genetic,
+        )
+
+
+def run(config: KeyframeConfig) -> None:
+    """Read, choose, write, report. Nothing appears at the output before all of it is done."""
+    console = Console()
+    root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
+    build.check_free(root, config.overwrite)
+    source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
+    if root == source.root.resolve():
+        raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
+    columns = resolve(source.features, config.columns)
+    vectors = read_vectors(source)
+    ends = gripper_ends(columns, vectors)
+    trajectories = {
+        number: trajectory_of(vectors[number], columns, ends, float(source.meta.fps), number)
+        for number in source.episodes
+    }
+    with build.published(root, config.overwrite) as partial, Progress(console=console) as progress:
+        options = config.options()
+        found = {
+            number: extract(trajectory, options, number)
+            for number, trajectory in progress.track(trajectories.items(), description="choosing keyframes")
+        }
+        bar = progress.add_task("writing episodes", total=len(found))
+        blank = build.write_dataset(
+            partial, source, columns, trajectories, found, config.output.repo_id, lambda: progress.advance(bar)
+        )
+        report = Report(
+            options=options,
+            source=config.dataset.repo_id,
+            columns=columns.chosen(),
+            is_joints=columns.is_joints,
+            episodes=found,
+            notices=[*notices(source, columns, ends), *blank],
+        )
+        write_json(partial / keys.KEYFRAMING_FILE, report.as_json())
+        (partial / keys.KEYFRAMING_FILE).with_suffix(".md").write_text(report.markdown(), encoding="utf-8")
+    report.show(console)
+    console.print(f"written to {root}", highlight=False)
+    if config.output.push_to_hub:
+        build.push(config.output.repo_id, root, config.output.private)

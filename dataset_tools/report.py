@@ -1,0 +1,155 @@
+"""What keyframing did: per episode and in total, as JSON beside the data, as Markdown, and on the terminal."""
+
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import lerobot_histmv
+from dataset_tools.keyframes import KeyframeOptions, Keyframing
+from lerobot_histmv import keys
+
+FORMAT = 1
+GAP_COUNTS_ABOVE = 1e-3
+"""The median gap is over episodes whose optimum is above this mean error [m per frame]; elsewhere it is noise."""
+
+_MARKS = {"start": "s", "pause": "p", "gripper": "g", "ga": "+", "end": "e"}
+_LEGEND = "pose frames: s start, p pause, g gripper change, + chosen by the method, e end"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that is told about a run.
+
+    Attributes:
+        options: how keyframes were chosen.
+        source: repo id of the dense dataset.
+        columns: columns used, as text.
+        is_joints: the curve is joint angles [rad] instead of a tool position [m].
+        episodes: keyframes by episode number of the source.
+        notices: what is missing in the dataset, was dropped or assumed.
+    """
+
+    options: KeyframeOptions
+    source: str
+    columns: Mapping[str, str]
+    is_joints: bool
+    episodes: Mapping[int, Keyframing]
+    notices: Sequence[str]
+
+    @property
+    def unit(self) -> str:
+        """Unit of errors."""
+        return "rad" if self.is_joints else "m"
+
+    def reasons(self) -> dict[str, int]:
+        """How many keyframes were kept for each reason."""
+        counted = Counter(frame.reason for found in self.episodes.values() for frame in found.keyframes)
+        return {reason: counted[reason] for reason in keys.REASONS}
+
+    def totals(self) -> dict[str, Any]:
+        """Figures over all episodes."""
+        found = list(self.episodes.values())
+        kept = sum(len(one.keyframes) for one in found)
+        gaps = [one.gap for one in found if one.optimum_mean > GAP_COUNTS_ABOVE]
+        return {
+            "episodes": len(found),
+            "frames": sum(one.frames for one in found),
+            "keyframes": kept,
+            "rows": kept - len(found),
+            "keyframes_per_episode": kept / len(found),
+            "reasons": self.reasons(),
+            "share_of_method": self.reasons()["ga"] / kept,
+            "error_mean": float(np.mean([one.error_mean for one in found])),
+            "error_max": max(one.error_max for one in found),
+            "median_gap": float(np.median(gaps)) if gaps else None,
+            "episodes_in_median_gap": len(gaps),
+            "seconds_per_episode": float(np.mean([one.seconds for one in found])),
+            "warnings": sum(bool(one.warning) for one in found),
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """Content of ``meta/keyframing.json``."""
+        return {
+            "format": FORMAT,
+            "options": asdict(self.options),
+            "unit": self.unit,
+            "source": self.source,
+            "columns": dict(self.columns),
+            "notices": list(self.notices),
+            "versions": {
+                "histmv": lerobot_histmv.__version__,
+                "lerobot": version("lerobot"),
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+            "totals": self.totals(),
+            "episodes": [{"source_episode": number, **asdict(one)} for number, one in self.episodes.items()],
+        }
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Cells of the table, one row per episode; the head is ``head``."""
+        return [
+            (
+                str(number),
+                str(one.frames),
+                str(len(one.keyframes)),
+                " ".join(f"{frame.pose_frame}{_MARKS[frame.reason]}" for frame in one.keyframes),
+                *(f"{1000 * value:.1f}" for value in (one.error_sum, one.error_mean, one.error_max)),
+                f"{100 * one.gap:.2f}",
+                f"{1000 * one.seconds:.0f}",
+            )
+            for number, one in self.episodes.items()
+        ]
+
+    def head(self) -> tuple[str, ...]:
+        """Column titles of ``rows``."""
+        milli = f"m{self.unit}"
+        errors = (f"sum {milli}", f"mean {milli}", f"max {milli}")
+        return ("episode", "frames", "kept", "pose frames", *errors, "gap %", "ms")
+
+    def summary(self) -> list[str]:
+        """A few lines for people."""
+        total, unit = self.totals(), f"m{self.unit}"
+        why = ", ".join(f"{count} {reason}" for reason, count in total["reasons"].items())
+        gap = total["median_gap"]
+        lines = [
+            f"{total['episodes']} episodes of {total['frames']} frames -> {total['keyframes']} keyframes "
+            f"({total['keyframes_per_episode']:.1f} per episode), {total['rows']} rows",
+            f"kept because of: {why}; the method ({self.options.method}) chose {100 * total['share_of_method']:.0f} %",
+            f"error: mean {1000 * total['error_mean']:.2f} {unit} per moving frame, largest "
+            f"{1000 * total['error_max']:.1f} {unit}; accepted {1000 * self.options.epsilon:g} {unit}",
+            "gap to the exact optimum: "
+            + (
+                f"median {100 * gap:.2f} % over {total['episodes_in_median_gap']} episodes"
+                if gap is not None
+                else "none"
+            )
+            + f" whose optimum is above {1000 * GAP_COUNTS_ABOVE:g} {unit} per frame",
+            f"time: {total['seconds_per_episode']:.3f} s per episode",
+            "columns: " + ", ".join(f"{name} = {column}" for name, column in self.columns.items()),
+        ]
+        warnings = [f"episode {number}: {one.warning}" for number, one in self.episodes.items() if one.warning]
+        return [*lines, *(f"note: {notice}" for notice in self.notices), *(f"warning: {line}" for line in warnings)]
+
+    def markdown(self) -> str:
+        """The report as a Markdown page."""
+        cells = [self.head(), tuple("---" for _ in self.head()), *self.rows()]
+        table = "\n".join(f"| {' | '.join(row)} |" for row in cells)
+        lines = "\n".join(f"- {line}" for line in self.summary())
+        return f"# Keyframes of {self.source}\n\n{lines}\n\n{_LEGEND}\n\n{table}\n"
+
+    def show(self, console: Console) -> None:
+        """Print the table and the summary."""
+        table = Table(*self.head(), title=f"Keyframes of {self.source}", caption=_LEGEND)
+        for row in self.rows():
+            table.add_row(*row)
+        console.print(table)
+        for line in self.summary():
+            console.print(line, highlight=False, markup=False)

@@ -1,0 +1,145 @@
+"""Reading the episodes that are to be keyframed: any LeRobot v3 dataset, checked before anything is written."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from jaxtyping import Float
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+
+from dataset_tools.columns import vectors
+from lerobot_histmv import keys
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset on disk; ``episodes`` are those to read."""
+
+    meta: LeRobotDatasetMetadata
+    root: Path
+    episodes: tuple[int, ...]
+
+    @cached_property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """LeRobot's feature dictionary."""
+        return self.meta.features
+
+    @cached_property
+    def depth_keys(self) -> frozenset[str]:
+        """Keys of the cameras declared as depth."""
+        return frozenset(self.meta.depth_keys)
+
+    def length(self, episode: int) -> int:
+        """Frames of an episode."""
+        return int(self.meta.episodes[episode]["length"])
+
+    def column(self, episode: int, key: str, frames: Sequence[int] | None = None) -> list[Any]:
+        """Stored values of a column at ``frames`` (all by default), one entry per frame."""
+        return self.table(episode, [key], frames).column(key).to_pylist()
+
+    def table(self, episode: int, columns: Sequence[str], frames: Sequence[int] | None = None) -> pa.Table:
+        """Stored columns at strictly rising ``frames`` of an episode (all by default).
+
+        Raises:
+            ValueError: the file is damaged or lacks some of these rows.
+        """
+        path = self.root / self.meta.get_data_file_path(episode)
+        wanted = range(self.length(episode)) if frames is None else frames
+        rows = pc.field("episode_index") == episode
+        if frames is not None:
+            rows &= pc.field("frame_index").isin(list(frames))
+        try:
+            table = pq.read_table(path, columns=[*columns, "frame_index"], filters=rows)
+        except (OSError, pa.ArrowException) as error:
+            raise ValueError(f"episode {episode}: cannot read {', '.join(columns)} from {path}: {error}") from error
+        if table.column("frame_index").to_pylist() != list(wanted):
+            raise ValueError(
+                f"episode {episode}: {path} holds {len(table)} of {len(wanted)} wanted rows, or not in order; the dataset "
+                "is not whole, so copy it again"
+            )
+        return table
+
+    def vectors(self, episode: int) -> dict[str, Float[np.ndarray, "n _"]]:
+        """All numeric columns of action and observation of a whole episode, (frames, size) each.
+
+        Raises:
+            ValueError: a value is missing, infinite or not a number; the message names episode, frame and entry.
+        """
+        names = vectors(self.features)
+        table = self.table(episode, list(names))
+        arrays = {}
+        for name, entries in names.items():
+            array = np.array(table.column(name).to_pylist(), dtype=np.float64).reshape(len(table), -1)
+            bad = np.argwhere(~np.isfinite(array))
+            if len(bad):
+                frame, entry = bad[0].tolist()
+                which = entries[entry] if entries else entry
+                raise ValueError(f"episode {episode}, frame {frame}: {name}[{which}] is {array[frame, entry]}")
+            arrays[name] = array
+        return arrays
+
+    def tasks(self, episode: int, frames: Sequence[int]) -> list[str]:
+        """Instruction at each frame."""
+        return [str(self.meta.tasks.iloc[index].name) for index in self.column(episode, "task_index", frames)]
+
+
+def open_source(
+    repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None, revision: str | None = None
+) -> Source:
+    """Dataset to keyframe; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
+
+    Raises:
+        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, or a dataset that
+            is keyframed already.
+    """
+    if root is not None:
+        _check_files(Path(root))
+    meta = LeRobotDatasetMetadata(repo_id, root, revision)
+    if keys.SOURCE_FRAME in meta.features:
+        raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
+    chosen = tuple(range(meta.total_episodes)) if episodes is None else tuple(episodes)
+    unknown = sorted(set(chosen) - set(range(meta.total_episodes)))
+    if unknown or not chosen:
+        raise ValueError(
+            f"episodes {unknown} do not exist; {repo_id} has {meta.total_episodes} of them, counted from 0"
+        )
+    missing = _missing_files(meta, chosen)
+    if missing and root is None:
+        meta = LeRobotDataset(repo_id, episodes=list(chosen), revision=revision).meta
+        missing = _missing_files(meta, chosen)
+    if missing:
+        raise ValueError(f"{meta.root} lacks {', '.join(map(str, missing))}; copy the dataset again")
+    _check_files(Path(meta.root))
+    return Source(meta, Path(meta.root), chosen)
+
+
+def _missing_files(meta: LeRobotDatasetMetadata, episodes: Sequence[int]) -> list[Path]:
+    wanted = {meta.get_data_file_path(episode) for episode in episodes}
+    wanted |= {meta.get_video_file_path(episode, key) for key in meta.video_keys for episode in episodes}
+    return sorted(path for path in wanted if not (meta.root / path).is_file())
+
+
+def _check_files(root: Path) -> None:
+    """ValueError unless ``root`` holds LeRobot metadata and parquet files that are whole."""
+    if not (root / "meta/info.json").is_file():
+        raise ValueError(
+            f"no LeRobot dataset at {root}: meta/info.json is missing (leave --dataset.root out to load from the Hub)"
+        )
+    try:
+        json.loads((root / "meta/info.json").read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{root}/meta/info.json is damaged: {error}") from error
+    for path in sorted(root.glob("**/*.parquet")):
+        try:
+            pq.read_metadata(path)
+        except (OSError, pa.ArrowException) as error:
+            raise ValueError(
+                f"{path} is damaged or was never finished ({error}); copy the dataset again, or record it again"
+            ) from error

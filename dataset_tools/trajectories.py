@@ -1,0 +1,126 @@
+"""Tool motion and action labels out of an episode's columns: one quaternion order, one meaning of the gripper."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.spatial.transform import Rotation
+
+from dataset_tools.columns import Column, Columns
+from dataset_tools.signals import Keyframe, Trajectory
+from dataset_tools.source import Source
+from lerobot_histmv import keys
+from lerobot_histmv.geometry import UNIT_TOLERANCE, canonical
+
+Vectors = Mapping[str, np.ndarray]
+"""An episode's numeric columns, (frames, size) each."""
+GripperEnds = tuple[float, float]
+"""Column values that mean closed and open."""
+
+_HYSTERESIS = 0.1
+"""The command changes where the opening passes 0.5 by this much."""
+_OUTSIDE = 0.1
+"""Share of the gripper's range by which a value may lie outside it."""
+
+
+def read_vectors(source: Source) -> dict[int, Vectors]:
+    """Numeric columns of each episode.
+
+    Raises:
+        ValueError: an entry that is no finite number, an episode of one frame; the message names episode and frame.
+    """
+    for episode in source.episodes:
+        if source.length(episode) < 2:
+            raise ValueError(
+                f"episode {episode} has 1 frame, but a macro step needs 2: leave it out with --dataset.episodes=[...], "
+                "or remove it with lerobot-edit-dataset"
+            )
+    return {episode: source.vectors(episode) for episode in source.episodes}
+
+
+def trajectory_of(vectors: Vectors, columns: Columns, ends: GripperEnds, fps: float, episode: int) -> Trajectory:
+    """Tool motion of one episode.
+
+    Raises:
+        ValueError: a quaternion that is not unit; the message names episode and frame.
+    """
+    return Trajectory(
+        position=columns.curve.of(vectors),
+        fps=fps,
+        quaternion=_quaternion(columns.rotation, columns.rotation_format, vectors, episode),
+        gripper=command(columns.gripper.of(vectors)[:, 0], ends) if columns.gripper else None,
+    )
+
+
+def gripper_ends(columns: Columns, episodes: Mapping[int, Vectors]) -> GripperEnds:
+    """Values that mean closed and open: those of ``columns``, else the ends of the range in the data.
+
+    Raises:
+        ValueError: a value outside the range of ``columns``; the message names episode and frame.
+    """
+    if columns.gripper is None:
+        return 0.0, 1.0
+    values = {episode: columns.gripper.of(vectors)[:, 0] for episode, vectors in episodes.items()}
+    if columns.gripper_range is None:
+        low, high = min(float(v.min()) for v in values.values()), max(float(v.max()) for v in values.values())
+        return (low, high) if low < high else (low - 1, high)
+    low, high = sorted(columns.gripper_range)
+    slack = _OUTSIDE * (high - low)
+    for episode, value in values.items():
+        outside = np.flatnonzero((value < low - slack) | (value > high + slack))
+        if len(outside):
+            raise ValueError(
+                f"episode {episode}, frame {outside[0]}: {columns.gripper} is {value[outside[0]]:g}, outside {low:g} "
+                f"to {high:g}; give --columns.gripper_range=[closed,open]"
+            )
+    return columns.gripper_range
+
+
+def command(values: Float[np.ndarray, " n"], ends: GripperEnds) -> Float[np.ndarray, " n"]:
+    """Gripper as 1 open or 0 closed; small changes about the middle do not count."""
+    opening = (values - ends[0]) / (ends[1] - ends[0])
+    clear = np.abs(opening - 0.5) >= _HYSTERESIS
+    clear[0] = True
+    latest = np.maximum.accumulate(np.where(clear, np.arange(len(values)), 0))
+    return (opening[latest] > 0.5).astype(np.float64)
+
+
+def label_names(columns: Columns) -> list[str]:
+    """Names of the entries of a keyframe's label: our pose names as far as recorded, or those of the joints."""
+    names = list(columns.curve.names) if columns.is_joints else list(keys.POSITION_NAMES)
+    if columns.is_joints and not names:
+        names = [f"joint_{index}.pos" for index in columns.curve.indices]
+    names += keys.QUATERNION_NAMES if columns.rotation else ()
+    return [*names, keys.GRIPPER_NAME] if columns.gripper else names
+
+
+def labels(trajectory: Trajectory, keyframes: Iterable[Keyframe]) -> Float32[np.ndarray, "k a"]:
+    """Measured pose at each pose frame, and the gripper command in force from then on."""
+    frames = [keyframe.pose_frame for keyframe in keyframes]
+    parts = [trajectory.position[frames]]
+    if trajectory.quaternion is not None:
+        parts.append(trajectory.quaternion[frames])
+    if trajectory.gripper is not None:
+        parts.append(trajectory.gripper[frames, None])
+    return np.hstack(parts).astype(np.float32)
+
+
+def _quaternion(
+    column: Column | None, rotation_format: str, vectors: Vectors, episode: int
+) -> Float[np.ndarray, "n 4"] | None:
+    """Canonical unit quaternions w, x, y, z."""
+    if column is None:
+        return None
+    values = column.of(vectors)
+    if rotation_format in ("rotvec", "rpy"):
+        turn = Rotation.from_rotvec(values) if rotation_format == "rotvec" else Rotation.from_euler("xyz", values)
+        return canonical(turn.as_quat(scalar_first=True))
+    norms = np.linalg.norm(values, axis=-1)
+    bad = np.flatnonzero(np.abs(norms - 1) >= UNIT_TOLERANCE)
+    if len(bad):
+        raise ValueError(
+            f"episode {episode}, frame {bad[0]}: {column} is {values[bad[0]].tolist()}, a quaternion of norm "
+            f"{norms[bad[0]]:.3g}; its norm must be 1"
+        )
+    ordered = values if rotation_format == "wxyz" else values[:, [3, 0, 1, 2]]
+    return canonical(ordered / norms[:, None])
