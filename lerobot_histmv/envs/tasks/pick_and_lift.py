@@ -17,10 +17,10 @@ CUBE_HEIGHT = 0.0201
 """Height [m] of a cube's centre on the table."""
 SUCCESS_HEIGHT = 0.2
 """The region of success is the space above this height [m] of the cube's centre."""
-ABOVE = 0.12
+ABOVE = 0.14
 """Height [m] of the via points over the cube."""
-CARRY = (0.42, 0.0, 0.30)
-"""Where the expert brings the cube: over the middle of the workspace."""
+CARRY = (0.28, 0.0, 0.30)
+"""Where the expert brings the cube [m]: in front of the robot."""
 
 TEMPLATES = {
     "train": (
@@ -69,7 +69,7 @@ class PickAndLift(Task):
         return "grasp missed" if self._closed else "not reached"
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
-        """Down over the cube, grasp, up and over the middle of the workspace."""
+        """Down over the cube, grasp, up and back towards the robot."""
         cube = self.targets[0]
         grasp = top_down(simulation.position(cube), _nearest_quarter_turn(simulation.yaw(cube)))
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)

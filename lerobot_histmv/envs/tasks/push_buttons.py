@@ -19,7 +19,7 @@ CAP_TOP = 0.042
 """Height [m] of an unpressed cap's top."""
 PUSH_HEIGHT = 0.032
 """Height [m] of the tool when the expert pushes."""
-ABOVE = 0.14
+ABOVE = 0.16
 """Height [m] of the via point over a button."""
 
 TEMPLATES = {
