@@ -41,15 +41,13 @@ class Stage:
         self.controller.ticks = 0
 
     @contextmanager
-    def watching(self, callback: Callable[[], None] | None) -> Iterator[None]:
+    def watching(self, callback: Callable[[], None]) -> Iterator[None]:
         """Call ``callback`` after every tick inside the block."""
-        watchers = self.simulation.after_tick
-        watchers.extend([callback] if callback else [])
+        self.simulation.after_tick.append(callback)
         try:
             yield
         finally:
-            if callback:
-                watchers.remove(callback)
+            self.simulation.after_tick.remove(callback)
 
     def go(self, pose: Pose, gripper: float, servo: bool) -> bool:
         """One step of the environment: a whole macro step, or one tick towards ``pose``. False if out of reach."""

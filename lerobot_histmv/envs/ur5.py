@@ -5,32 +5,98 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from jaxtyping import Float, UInt8
 
-from lerobot_histmv import geometry, keys
-from lerobot_histmv.envs.motion import Motion, Pose, Tick
+from lerobot_histmv import keys
+from lerobot_histmv.envs import interface
+from lerobot_histmv.envs.interface import CAMERA_NAMES
+from lerobot_histmv.envs.motion import Motion, Tick
 from lerobot_histmv.envs.tasks import TASKS
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.stage import Stage
 
-CAMERA_NAMES = ("front", "left_shoulder", "wrist")
-CONTROLS = ("macro", "servo")
-WORKSPACE_LOW = np.array([0.15, -0.45, 0.01])
-WORKSPACE_HIGH = np.array([0.75, 0.45, 0.60])
-"""Commanded positions [m] are clipped to this box."""
 SERVO_TICKS = 40
 """With ``control="servo"`` each macro step of the time limit is worth this many ticks."""
-STATE_SIZE = 14
 
 Observation = dict[str, Any]
 
 
 class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
-    """A UR5e with a Robotiq 2F-85 at a table."""
+    """A UR5e with a Robotiq 2F-85 at a table, doing one of ``TASKS``.
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    Frame: the robot's base (ROS ``base_link``) = world, metres, z up, table top at z = 0. The tool is the pinch point
+    between the finger pads; its z axis points where the gripper points, its y axis from finger to finger.
+
+    **Action**, float32 (8,), absolute:
+
+    | index | name | meaning | min | max | unit |
+    |---|---|---|---|---|---|
+    | 0 | ee.x.pos | tool target x | 0.15 | 0.75 | m |
+    | 1 | ee.y.pos | tool target y | -0.45 | 0.45 | m |
+    | 2 | ee.z.pos | tool target z | 0.01 | 0.60 | m |
+    | 3 to 6 | ee.qw.pos, ee.qx.pos, ee.qy.pos, ee.qz.pos | tool target quaternion, normalised here | -1 | 1 | |
+    | 7 | gripper.pos | gripper command: above 0.5 open, else closed | 0 | 1 | |
+
+    With ``control="macro"`` a step is a macro step: the tool moves to the target in a straight line with the gripper as it
+    is (where that crosses a singularity, in a straight line in joint space), then the gripper takes its command (0.5 s, if it
+    changed), then the arm rests for 0.1 s. With ``control="servo"`` a step is one tick of 50 ms towards the target, no joint
+    faster than 180 degrees per second. Positions outside the box are clipped to it. A pose that the arm cannot reach
+    leaves the arm where it is. An arm that is blocked stops (protective stop) and the step ends. An action of another shape, with
+    a number that is not finite or a quaternion of length 0 raises ValueError.
+
+    **Observation**, for n = ``image_size`` and K ``cameras``:
+
+    | key | type, shape | meaning |
+    |---|---|---|
+    | pixels/<camera> | uint8 (n, n, 3) | colour |
+    | <camera>_depth | uint16 (n, n, 1) | distance along the optical axis [mm], 0 = none |
+    | agent_pos | float32 (14,) | measured tool pose (7 as in the action), gripper opening (1 open), joint angles [rad] (6) |
+    | camera_intrinsics | float32 (4 K) | fx fy cx cy [pixels] of each camera |
+    | camera_extrinsics | float32 (12 K) | rows of the 3x4 T_world_cam of each camera |
+
+    Cameras: front and left_shoulder are fixed, wrist moves with the gripper.
+
+    **Tasks.** Objects lie in x 0.3 to 0.6, y -0.28 to 0.28 [m]; target and distractors differ in colour (red, green, blue,
+    yellow, purple, cyan).
+
+    | task | scene | success | variations | expert's macro steps |
+    |---|---|---|---|---|
+    | reach_target | 3 spheres 5 to 20 cm up | tool within 2 cm of the named sphere's centre | 6 colours | 2 |
+    | push_buttons | 3 buttons, >= 14 cm apart | the named 1 to 3 pressed (3 mm) in order, no other | 18 sequences | 2 per button |
+    | pick_and_lift | 3 cubes of 4 cm, any yaw, >= 10 cm apart | both pads touch the named cube, its centre above 0.2 m | 6 colours | 4 |
+
+    Success is judged when a step ends (what was pressed is remembered from every tick). Reward: 1 on success, else 0.
+    **End**: ``terminated`` at success; ``truncated`` after twice the expert's macro steps (servo: 40 ticks for each).
+
+    **Reset.** The tool is at (0.28, 0, 0.40), pointing down; the gripper is open, but closed in push_buttons, where it is the
+    pushing tool. The seed alone decides variation, instruction and scene (``options={"variation": i}`` or the argument fixes the
+    variation, and nothing else changes but the colours). Seeds below 100,000 are for recording, up to 199,999 for evaluation during
+    training, from 200,000 for reported results.
+
+    **Info**: ``is_success`` bool, ``instruction``, ``variation``, ``ticks`` (control periods so far) and ``failure``: empty until
+    an episode is truncated, then the first that holds of
+
+    | failure | meaning |
+    |---|---|
+    | ik | an action of this episode was out of reach |
+    | wrong object | another object was grasped, touched or pressed, or a named button out of turn |
+    | grasp missed | the gripper closed, but never on the target |
+    | not reached | nothing was grasped, touched or pressed |
+    | time | the right thing was begun and not finished |
+
+    Args:
+        task: name in ``TASKS``.
+        cameras: which cameras to render, in which order.
+        image_size: side of the images [pixels].
+        control: ``macro`` or ``servo``.
+        variation: the one variation to use, or None to draw it from the seed.
+        instruction_split: paraphrases to draw from, ``train`` or ``held_out``.
+        render_mode: ``rgb_array``.
+        render_size: side of what ``render`` and ``substep_frames`` return [pixels].
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(interface.RENDER_MODES), "render_fps": 20}
 
     def __init__(
         self,
@@ -43,40 +109,26 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         render_mode: str = "rgb_array",
         render_size: int = 256,
     ) -> None:
-        if task not in TASKS:
-            raise ValueError(f"task {task!r} is unknown; tasks are {sorted(TASKS)}")
-        unknown = [camera for camera in cameras if camera not in CAMERA_NAMES]
-        if unknown or not cameras or len(set(cameras)) < len(cameras):
-            raise ValueError(f"cameras {list(cameras)} must be different names out of {list(CAMERA_NAMES)}")
-        for name, value, accepted in (
-            ("control", control, CONTROLS),
-            ("instruction_split", instruction_split, ("train", "held_out")),
-            ("render_mode", render_mode, self.metadata["render_modes"]),
-        ):
-            if value not in accepted:
-                raise ValueError(f"{name} is {value!r}; accepted are {list(accepted)}")
-        for name, size in (("image_size", image_size), ("render_size", render_size)):
-            if not 8 <= size <= 1024:
-                raise ValueError(f"{name} is {size}; it must lie between 8 and 1024 pixels")
+        interface.check_options(
+            task, cameras, image_size, control, variation, instruction_split, render_mode, render_size
+        )
         self.task = task
         self.cameras = tuple(cameras)
         self.image_size, self.render_size = image_size, render_size
         self.control, self.render_mode = control, render_mode
         self.instruction_split = instruction_split
         self.record_substeps = False
-        self._fixed_variation = None if variation is None else self._checked_variation(variation)
+        self.action_space = interface.action_space()
+        self.observation_space = interface.observation_space(self.cameras, image_size)
+        self._fixed_variation = variation
         self._stage: Stage | None = None
-        self.task_description = TASKS[task].instructions(variation or 0, instruction_split)[0]
-        self.action_space = spaces.Box(
-            np.float32([*WORKSPACE_LOW, -1, -1, -1, -1, 0]), np.float32([*WORKSPACE_HIGH, 1, 1, 1, 1, 1])
-        )
-        self.observation_space = _observation_space(self.cameras, image_size)
+        self.variation = variation or 0
+        self.task_description = self.paraphrases[0]
 
-    def _checked_variation(self, variation: int) -> int:
-        count = len(TASKS[self.task].variations)
-        if not 0 <= variation < count:
-            raise ValueError(f"variation {variation} of {self.task} does not exist; there are 0 to {count - 1}")
-        return variation
+    @property
+    def paraphrases(self) -> tuple[str, ...]:
+        """All instructions of the current variation, in the split that ``instruction_split`` names."""
+        return TASKS[self.task].instructions(self.variation, self.instruction_split)
 
     @property
     def _max_episode_steps(self) -> int:
@@ -86,100 +138,83 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         return max(self._step_limit(variation) for variation in variations)
 
     def _step_limit(self, variation: int) -> int:
-        """Twice the expert's macro steps, or as much time in ticks."""
         limit = 2 * TASKS[self.task].macro_steps(variation)
         return limit if self.control == "macro" else limit * SERVO_TICKS
 
     @property
     def stage(self) -> "Stage":
-        """Simulation, controller, task and cameras; built on first use."""
+        """Simulation, controller, task and cameras; they exist from the first reset on."""
         if self._stage is None:
-            from lerobot_histmv.envs.stage import Stage
-
-            self._stage = Stage(self.task, max(self.image_size, self.render_size))
+            raise gymnasium.error.ResetNeeded("reset the environment first")
         return self._stage
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode. ``seed`` alone decides the scene; ``options={"variation": 2}`` fixes what is asked for."""
+        """Start an episode.
+
+        Args:
+            seed: decides the episode; None draws one from the environment's own generator.
+            options: ``{"variation": i}`` fixes the variation of this episode.
+        """
         super().reset(seed=seed)
         rng = np.random.default_rng(self.np_random.integers(2**63) if seed is None else seed)
         drawn = int(rng.integers(len(TASKS[self.task].variations)))
         asked = (options or {}).get("variation", self._fixed_variation)
-        self.variation = drawn if asked is None else self._checked_variation(asked)
-        phrase = rng.random()
-        self.task_description = self.paraphrases[int(phrase * len(self.paraphrases))]
+        self.variation = drawn if asked is None else interface.check_variation(self.task, asked)
+        self.task_description = self.paraphrases[int(rng.random() * len(self.paraphrases))]
+        if self._stage is None:
+            from lerobot_histmv.envs.stage import Stage
+
+            self._stage = Stage(self.task, max(self.image_size, self.render_size))
+        self._steps, self._out_of_reach = 0, False
         self._frames: list[UInt8[np.ndarray, "h w 3"]] = []
-        self._steps = 0
-        self._out_of_reach = False
         self.stage.reset(self.variation, rng)
         self._capture()
         return self.observe(), self._info(ended=False)
 
-    @property
-    def paraphrases(self) -> tuple[str, ...]:
-        """All instructions of the current variation, in the split that ``instruction_split`` names."""
-        return TASKS[self.task].instructions(self.variation, self.instruction_split)
-
-    def step(
-        self, action: Float[np.ndarray, " 8"]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Go to ``action``; see the class for what that means and for what comes back."""
-        pose, gripper = self._parse(action)
+    def step(self, action: Float[np.ndarray, " 8"]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Go to ``action``; the class says what that means and what comes back."""
+        pose, gripper = interface.parse_action(action)
+        stage = self.stage
         self._frames = []
-        with self.stage.watching(self._capture if self.record_substeps else None):
-            reached = self.stage.go(pose, gripper, servo=self.control == "servo")
+        with stage.watching(self._capture):
+            reached = stage.go(pose, gripper, servo=self.control == "servo")
         self._out_of_reach |= not reached
         self._steps += 1
         success = self.is_success()
         truncated = not success and self._steps >= self._step_limit(self.variation)
         return self.observe(), float(success), success, truncated, self._info(ended=truncated)
 
-    def _parse(self, action: Float[np.ndarray, " 8"]) -> tuple[Pose, float]:
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (8,):
-            raise ValueError(f"action has shape {action.shape}; it must be (8,): {', '.join(keys.POSE_NAMES)}")
-        if not np.isfinite(action).all():
-            raise ValueError(f"action {action.tolist()} is not finite ({', '.join(keys.POSE_NAMES)})")
-        norm = np.linalg.norm(action[3:7])
-        if norm < 1e-6:
-            raise ValueError(f"action's quaternion {action[3:7].tolist()} has no direction; it must be a rotation (wxyz)")
-        position = np.clip(action[:3], WORKSPACE_LOW, WORKSPACE_HIGH)
-        return Pose(position, geometry.canonical(action[3:7] / norm)), float(action[7] > 0.5)
-
     def is_success(self) -> bool:
         """Whether the task is fulfilled now."""
         return self.stage.task.is_success(self.stage.simulation)
 
     def _info(self, ended: bool) -> dict[str, Any]:
-        success = self.is_success()
-        failure = ""
-        if ended and not success:
-            failure = "ik" if self._out_of_reach else self.stage.task.failure()
+        failure = "ik" if self._out_of_reach else self.stage.task.failure()
         return {
-            "is_success": success,
+            "is_success": self.is_success(),
             "instruction": self.task_description,
             "variation": self.variation,
-            "failure": failure,
+            "failure": failure if ended else "",
             "ticks": self.stage.controller.ticks,
         }
 
     def observe(self) -> Observation:
-        """The current observation, freshly rendered; see ``observation_space``."""
-        stage, size = self.stage, self.image_size
-        pixels, observation = {}, {}
+        """The current observation, freshly rendered."""
+        stage, depths, pixels, intrinsics, extrinsics = self.stage, {}, {}, [], []
         for camera in self.cameras:
-            color, depth = stage.renderer.render(stage.simulation.data, camera, size)
-            pixels[camera], observation[f"{camera}{keys.DEPTH_SUFFIX}"] = color, depth
-        intrinsics = [stage.renderer.intrinsics(camera, size) for camera in self.cameras]
-        extrinsics = [stage.renderer.extrinsics(stage.simulation.data, camera).ravel() for camera in self.cameras]
+            data = stage.simulation.data
+            pixels[camera], depth = stage.renderer.render(data, camera, self.image_size)
+            depths[f"{camera}{keys.DEPTH_SUFFIX}"] = depth
+            intrinsics.append(stage.renderer.intrinsics(camera, self.image_size))
+            extrinsics.append(stage.renderer.extrinsics(data, camera).ravel())
         return {
             "pixels": pixels,
             "agent_pos": stage.state(),
+            **depths,
             "camera_intrinsics": np.concatenate(intrinsics).astype(np.float32),
             "camera_extrinsics": np.concatenate(extrinsics).astype(np.float32),
-            **observation,
         }
 
     def expert(self) -> Iterator[Motion]:
@@ -187,7 +222,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         return self.stage.task.expert(self.stage.simulation)
 
     def execute(self, motion: Motion, on_tick: Callable[[Tick], None] | None = None) -> None:
-        """Run one blended motion of an expert at 20 Hz.
+        """Run one blended motion at 20 Hz, whatever ``control`` is. It does not count as a step.
 
         Args:
             motion: what to do.
@@ -196,19 +231,20 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         Raises:
             ValueError: the target is out of reach.
         """
-        self.stage.controller.on_tick = on_tick
+        controller = self.stage.controller
+        controller.on_tick = on_tick
         try:
-            if not self.stage.controller.execute(motion):
+            if not controller.execute(motion):
                 raise ValueError(f"{motion.target} is out of the arm's reach")
         finally:
-            self.stage.controller.on_tick = None
+            controller.on_tick = None
 
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """The front camera's view, ``render_size`` pixels a side."""
         return self.stage.renderer.render(self.stage.simulation.data, "front", self.render_size)[0]
 
     def substep_frames(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Front camera frames of every tick of the last step, or of the last reset; empty unless ``record_substeps``."""
+        """What ``render`` showed at every tick of the last step, or after the last reset; empty unless ``record_substeps``."""
         return list(self._frames)
 
     def _capture(self) -> None:
@@ -222,17 +258,5 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
             self._stage = None
 
     def __getstate__(self) -> dict[str, Any]:
+        """Everything but the simulation: an unpickled environment wants a reset."""
         return {**self.__dict__, "_stage": None}
-
-
-def _observation_space(cameras: Sequence[str], size: int) -> spaces.Dict:
-    def floats(count: int) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (count,), np.float32)
-
-    pixels = spaces.Dict({camera: spaces.Box(0, 255, (size, size, 3), np.uint8) for camera in cameras})
-    depths = {f"{camera}{keys.DEPTH_SUFFIX}": spaces.Box(0, 65535, (size, size, 1), np.uint16) for camera in cameras}
-    calibration = {
-        "camera_intrinsics": floats(len(keys.intrinsics_names(cameras))),
-        "camera_extrinsics": floats(len(keys.extrinsics_names(cameras))),
-    }
-    return spaces.Dict({"pixels": pixels, "agent_pos": floats(STATE_SIZE), **depths, **calibration})

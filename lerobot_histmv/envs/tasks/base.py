@@ -12,6 +12,8 @@ from lerobot_histmv.envs.motion import Motion
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
+SPLITS = ("train", "held_out")
+"""Instructions for recording and training, and paraphrases kept back for evaluation."""
 COLORS = {
     "red": (0.85, 0.1, 0.1),
     "green": (0.1, 0.65, 0.2),
