@@ -1,0 +1,149 @@
+"""Heat map over a view's cloud: a distribution on valid pixels whose expectation is the position."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from lerobot_histmv.model.decoder import Decoder, Prediction, spatial_log_softmax
+
+M, Y, X, WIDTH = 3, 32, 48, 8
+SKIPS = [4, 5, 5, 5]
+
+
+def logits_and_mask() -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(M, Y, X, generator=generator), torch.rand(M, Y, X, generator=generator) < 0.5
+
+
+def test_heat_map_is_a_distribution_over_valid_pixels() -> None:
+    logits, valid = logits_and_mask()
+    heat = spatial_log_softmax(logits, valid).exp()
+    torch.testing.assert_close(heat.sum(dim=(1, 2)), torch.ones(M))
+    assert heat[~valid].eq(0).all()
+    assert heat[valid].gt(0).all()
+
+
+def test_heat_map_keeps_the_order_of_logits_and_ignores_those_of_invalid_pixels() -> None:
+    logits, valid = logits_and_mask()
+    log_heat = spatial_log_softmax(logits, valid)
+    assert log_heat[0][valid[0]].argsort().equal(logits[0][valid[0]].argsort())
+    spoiled = torch.where(valid, logits, 1e4)
+    torch.testing.assert_close(spatial_log_softmax(spoiled, valid), log_heat)
+
+
+def test_heat_map_of_a_view_that_sees_nothing_is_finite_and_has_finite_gradients() -> None:
+    logits, valid = logits_and_mask()
+    valid[1] = False
+    logits.requires_grad_()
+    log_heat = spatial_log_softmax(logits, valid)
+    heat = log_heat.exp()
+    torch.testing.assert_close(heat.sum(dim=(1, 2)), torch.ones(M))
+    assert log_heat[1].isfinite().all()
+    (heat * torch.arange(X)).sum().backward()
+    assert logits.grad is not None
+    assert logits.grad.isfinite().all()
+
+
+class Planted(nn.Module):
+    """Stands for the first decoder: the same logits whatever the features."""
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__()
+        self.logits = nn.Parameter(logits)
+
+    def forward(self, *_: object) -> Tensor:
+        return self.logits
+
+
+def inputs(seed: int = 1) -> dict[str, object]:
+    generator = torch.Generator().manual_seed(seed)
+    maps, view = torch.randn(2, M, WIDTH, Y // 16, X // 16, generator=generator)
+    skips = [
+        torch.randn(M, channels, Y // stride, X // stride, generator=generator)
+        for channels, stride in zip(SKIPS, (2, 4, 8, 16), strict=True)
+    ]
+    cloud = torch.rand(M, 3, Y, X, generator=generator)
+    return {
+        "maps": maps,
+        "view": view,
+        "skips": skips,
+        "cloud": cloud,
+        "valid": torch.rand(M, Y, X, generator=generator) < 0.7,
+    }
+
+
+def decoder(seed: int = 0) -> Decoder:
+    torch.manual_seed(seed)
+    return Decoder(WIDTH, SKIPS)
+
+
+def decode(module: Decoder, given: dict[str, object]) -> Prediction:
+    return module(**given)  # type: ignore[arg-type]
+
+
+def test_planted_peak_recovers_the_cloud_point_of_its_pixel_exactly() -> None:
+    given, module = inputs(), decoder()
+    pixels = [(3, 5), (17, 29), (31, 47)]
+    logits = torch.zeros(M, Y, X)
+    for m, (row, column) in enumerate(pixels):
+        given["valid"][m, row, column] = True
+        logits[m, row, column] = 100.0
+    module.position = Planted(logits)
+    expected = torch.stack([given["cloud"][m, :, row, column] for m, (row, column) in enumerate(pixels)])
+    torch.testing.assert_close(decode(module, given).surface, expected, atol=0, rtol=0)
+
+
+def test_position_is_the_heat_map_s_mean_over_the_cloud_plus_an_offset() -> None:
+    given, module = inputs(), decoder()
+    found = decode(module, given)
+    expected = (found.log_heat.exp()[:, None] * given["cloud"]).sum(dim=(2, 3))
+    torch.testing.assert_close(found.surface, expected)
+    given["cloud"] = given["cloud"] + 3
+    moved = decode(module, given)
+    torch.testing.assert_close(moved.surface, found.surface + 3)
+    torch.testing.assert_close(moved.position - moved.surface, found.position - found.surface, atol=1e-5, rtol=0)
+
+
+def test_planted_peak_has_a_gradient_that_moves_the_surface_point() -> None:
+    """Gradient descent on the position through the heat map alone finds a target on the cloud."""
+    given, module = inputs(), decoder()
+    module.position = Planted(torch.zeros(M, Y, X))
+    target = given["cloud"][:, :, 11, 13]
+    optimizer = torch.optim.Adam(module.position.parameters(), lr=0.05)
+    errors = []
+    for _ in range(40):
+        optimizer.zero_grad()
+        error = (decode(module, given).surface - target).square().sum()
+        error.backward()
+        optimizer.step()
+        errors.append(error.item())
+    assert errors[-1] < 0.05 * errors[0]
+
+
+def test_prediction_has_unit_quaternions_and_the_view_s_size() -> None:
+    found = decode(decoder(), inputs())
+    assert found.log_heat.shape == (M, Y, X)
+    torch.testing.assert_close(found.quaternion.norm(dim=1), torch.ones(M))
+    assert found.gripper.shape == (M,)
+
+
+def test_zero_numbers_give_a_finite_quaternion_and_gradient() -> None:
+    module = decoder()
+    last = module.pose.dense[-1]
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    found = decode(module, inputs())
+    found.quaternion.sum().backward()
+    assert found.quaternion.isfinite().all()
+    assert last.weight.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["maps", "view", "skips"])
+def test_decoders_use_history_view_and_every_skip(name: str) -> None:
+    given = inputs()
+    leaves = given[name] if name == "skips" else [given[name]]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    found = decode(decoder(), given)
+    (found.position.square().sum() + found.gripper.sum()).backward()
+    assert all(leaf.grad.abs().sum() > 0 for leaf in leaves)

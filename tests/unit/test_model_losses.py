@@ -1,0 +1,98 @@
+"""Loss terms: each in closed form, named, and finite when a view sees nothing."""
+
+import math
+
+import pytest
+import torch
+
+from lerobot_histmv.model.config import LossConfig
+from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.losses import action_losses, heat_loss, quaternion_loss, term_weights
+
+M, Y, X = 3, 5, 7
+
+
+def unit(count: int, seed: int) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 4, generator=torch.Generator().manual_seed(seed)), dim=1)
+
+
+def test_rotation_loss_chooses_the_nearer_sign_for_each_sample() -> None:
+    predicted, target = unit(11, 0), unit(11, 1)
+    signs = torch.tensor([1, -1] * 5 + [1])[:, None]
+    loss = quaternion_loss(predicted, target)
+    torch.testing.assert_close(quaternion_loss(predicted, signs * target), loss)
+    torch.testing.assert_close(quaternion_loss(signs * predicted, target), loss)
+    torch.testing.assert_close(loss, 2 - 2 * (predicted * target).sum(dim=1).abs())
+    torch.testing.assert_close(quaternion_loss(target, signs * target), torch.zeros(11))
+
+
+def heat_case() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A flat cloud with pixels 1 cm apart, uniform heat, and targets on pixels (2, 3)."""
+    rows, columns = torch.meshgrid(torch.arange(Y), torch.arange(X), indexing="ij")
+    cloud = 0.01 * torch.stack([columns, rows, torch.zeros(Y, X)]).expand(M, 3, Y, X)
+    uniform = torch.full((M, Y, X), -math.log(Y * X))
+    return uniform, cloud.contiguous(), cloud[:, :, 2, 3]
+
+
+def test_heat_loss_of_a_uniform_map_is_the_logarithm_of_its_pixels() -> None:
+    torch.testing.assert_close(heat_loss(*heat_case()), torch.full((M,), math.log(Y * X)))
+
+
+def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
+    _, cloud, target = heat_case()
+    centimetres = 100 * (cloud - target[:, :, None, None]).norm(dim=1)
+    maps = [(sign * centimetres).flatten(1).log_softmax(dim=1).unflatten(1, (Y, X)) for sign in (-1, 0, 1)]
+    losses = [heat_loss(log_heat, cloud, target) for log_heat in maps]
+    assert (losses[0] < losses[1]).all()
+    assert (losses[1] < losses[2]).all()
+
+
+def test_heat_loss_is_zero_where_the_target_is_not_seen() -> None:
+    uniform, cloud, target = heat_case()
+    torch.testing.assert_close(heat_loss(uniform, cloud, target + 5), torch.zeros(M))
+
+
+def test_heat_loss_is_finite_with_invalid_pixels_and_for_a_view_without_any() -> None:
+    uniform, cloud, target = heat_case()
+    logits = uniform.clone()
+    logits[0, 2:] = -torch.inf
+    logits[1] = -torch.inf
+    logits.requires_grad_()
+    loss = heat_loss(logits, cloud, target)
+    loss.sum().backward()
+    assert loss.isfinite().all()
+    assert logits.grad is not None
+    assert logits.grad.isfinite().all()
+    assert loss[1] == 0
+
+
+def prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor]:
+    log_heat, cloud, position = heat_case()
+    gripper = torch.tensor([2.0, -1.0, 0.5])
+    predicted = Prediction(position + torch.tensor([0.0, 0.03, 0.04]), position, unit(M, 2), gripper, log_heat)
+    return predicted, torch.cat([position, unit(M, 3), torch.tensor([[1.0], [0.0], [0.0]])], dim=1), cloud
+
+
+def test_position_loss_is_the_squared_distance_in_its_unit() -> None:
+    for length in (0.01, 0.05, 0.1):
+        terms = action_losses(*prediction(), LossConfig(position_unit=length))
+        torch.testing.assert_close(terms["position"], torch.full((M,), (0.05 / length) ** 2), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("form", ["bce", "mse"])
+def test_gripper_loss_in_both_forms(form: str) -> None:
+    logits, wanted = torch.tensor([2.0, -1.0, 0.5]), torch.tensor([1.0, 0.0, 0.0])
+    probability = 1 / (1 + torch.exp(-logits))
+    right = torch.where(wanted == 1, probability, 1 - probability)
+    expected = -right.log() if form == "bce" else (1 - right).square()
+    torch.testing.assert_close(action_losses(*prediction(), LossConfig(gripper=form))["gripper"], expected)
+
+
+@pytest.mark.parametrize("heatmap", [0.0, 0.5])
+def test_every_term_has_a_weight_of_its_name(heatmap: float) -> None:
+    config = LossConfig(action=3.0, mutual_information=0.2, heatmap=heatmap)
+    terms, weights = action_losses(*prediction(), config), term_weights(config)
+    assert {*terms, "mutual_information"} <= set(weights)
+    assert ("heatmap" in terms) == (heatmap > 0)
+    assert [weights[name] for name in ("position", "rotation", "gripper")] == [3.0] * 3
+    assert (weights["mutual_information"], weights["heatmap"]) == (0.2, heatmap)

@@ -1,0 +1,111 @@
+"""View weights: a softmax over present views, taught by fusion, redundancy and the decoding of every view."""
+
+import pytest
+import torch
+
+from lerobot_histmv.model.config import ViewConfig
+from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views, most_informative
+
+N, K, D, H, W, TEXT = 2, 3, 11, 5, 7, 13
+
+
+def attention(**changes: object) -> ViewAttention:
+    torch.manual_seed(0)
+    return ViewAttention(ViewConfig(mi_dims=3, **changes), D, TEXT)
+
+
+def inputs() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    maps = torch.randn(N, K, D, H, W, generator=generator)
+    return maps, torch.randn(N, TEXT, generator=generator), torch.ones(N, K, dtype=torch.bool)
+
+
+def test_weights_are_a_distribution_that_depends_on_views_and_instruction() -> None:
+    maps, text, present = inputs()
+    weights = attention()(maps, text, present)
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(N))
+    assert (weights > 0).all()
+    assert not torch.allclose(weights, attention()(maps.flip(1), text, present))
+    assert not torch.allclose(weights, attention()(maps, -text, present))
+
+
+def test_weights_follow_the_order_of_views() -> None:
+    maps, text, present = inputs()
+    order = torch.tensor([2, 0, 1])
+    torch.testing.assert_close(attention()(maps[:, order], text, present), attention()(maps, text, present)[:, order])
+
+
+def test_absent_views_weigh_nothing_and_do_not_matter() -> None:
+    maps, text, present = inputs()
+    present[:, 1] = False
+    weights = attention()(maps, text, present)
+    assert weights[:, 1].eq(0).all()
+    maps[:, 1] = 1e3
+    torch.testing.assert_close(attention()(maps, text, present), weights)
+
+
+@pytest.mark.xfail(strict=True, reason="softmax over no view is NaN")
+def test_weights_are_finite_when_no_view_is_present() -> None:
+    """Valid depth that lies outside of the workspace everywhere must not turn weights into NaN."""
+    maps, text, _ = inputs()
+    weights = attention()(maps, text, torch.zeros(N, K, dtype=torch.bool))
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(N))
+
+
+@pytest.mark.parametrize("form", ["nmi", "text", "literal"])
+def test_redundancy_teaches_weights_but_not_features(form: str) -> None:
+    maps, text, present = inputs()
+    module, maps = attention(mi_loss=form), maps.requires_grad_()
+    weights = module(maps.detach(), text, present)
+    weights.retain_grad()
+    module.redundancy(maps, weights).sum().backward()
+    assert maps.grad is None, "features must not win by turning into noise"
+    assert weights.grad is not None
+    assert weights.grad.abs().sum() > 0
+
+
+def test_projection_does_not_depend_on_the_global_seed_and_is_orthogonal() -> None:
+    torch.manual_seed(5)
+    first = attention().projection
+    torch.manual_seed(7)
+    torch.testing.assert_close(first, attention().projection)
+    torch.testing.assert_close(first.T @ first, torch.eye(first.shape[1]), atol=1e-5, rtol=0)
+
+
+def test_fusion_is_the_weighted_sum_and_the_best_view_its_largest_weight() -> None:
+    maps, text, present = inputs()
+    weights = attention()(maps, text, present)
+    expected = sum(weights[:, k, None, None, None] * maps[:, k] for k in range(K))
+    torch.testing.assert_close(fuse_views(maps, weights), expected)
+    torch.testing.assert_close(fuse_views(maps, torch.eye(K)[[1, 2]]), torch.stack([maps[0, 1], maps[1, 2]]))
+    assert most_informative(torch.tensor([[0.2, 0.5, 0.3], [0.6, 0.1, 0.3]])).tolist() == [1, 0]
+
+
+WEIGHTS = torch.tensor([[0.2, 0.5, 0.3], [0.6, 0.0, 0.4]])
+
+
+def test_argmax_decodes_the_most_informative_view_of_each_step() -> None:
+    pairs, shares = choose_views(WEIGHTS, "argmax")
+    assert pairs.tolist() == [[0, 1], [1, 0]]
+    assert shares.tolist() == [1, 1]
+
+
+def test_sampling_draws_each_view_as_often_as_its_weight() -> None:
+    torch.manual_seed(0)
+    pairs, shares = choose_views(WEIGHTS[:1].expand(4001, 3), "sampled")
+    frequency = torch.bincount(pairs[:, 1], minlength=3) / len(pairs)
+    torch.testing.assert_close(frequency, WEIGHTS[0], atol=0.03, rtol=0)
+    assert shares.eq(1).all()
+
+
+def test_expected_loss_decodes_all_views_and_shares_one_unit_among_the_present() -> None:
+    weights = WEIGHTS.clone().requires_grad_()
+    pairs, shares = choose_views(weights, "expected")
+    assert pairs.tolist() == [[n, k] for n in range(2) for k in range(3)]
+    per_step = shares.unflatten(0, (2, 3))
+    torch.testing.assert_close(per_step.sum(dim=1), torch.ones(2))
+    assert per_step[1, 1] == 0, "an absent view takes no part"
+    assert (per_step[WEIGHTS > 0] > 0).all()
+    (shares * torch.arange(6)).sum().backward()
+    assert weights.grad is not None
+    assert weights.grad[0].diff().gt(0).all(), "a view that decodes worse loses weight"

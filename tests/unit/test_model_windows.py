@@ -1,0 +1,169 @@
+"""From LeRobot's batch to packed windows: only real rows, metres, and tool positions of the past only."""
+
+from typing import Any
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tiny_scene import SIZE, cameras_around, noise_images
+
+from lerobot_histmv import keys
+from lerobot_histmv.model.augment import AugmentConfig, random_world_motion
+from lerobot_histmv.model.cameras import project
+from lerobot_histmv.windows import Window, causal_heat, read_window
+
+B, T, CAMERAS = 3, 5, ["front", "wrist"]
+K = len(CAMERAS)
+PADS = (0, 2, 4)
+
+
+def window_batch() -> dict[str, Any]:
+    """Three windows of five steps, of which the first 0, 2 and 4 are padding."""
+    generator = torch.Generator().manual_seed(0)
+    rgb, depth = (v.unflatten(0, (B, T)) for v in noise_images(B * T, K, generator))
+    intrinsics, extrinsics = (v.flatten().repeat(B, T, 1) for v in cameras_around(K))
+    pose = torch.randn(2, B, T, 8, generator=generator)
+    pose[..., 3:7] = torch.nn.functional.normalize(pose[..., 3:7], dim=-1)
+    batch = {
+        keys.STATE: torch.cat([pose[0], torch.zeros(B, T, 6)], dim=-1),
+        keys.ACTION: pose[1],
+        keys.INTRINSICS: intrinsics,
+        keys.EXTRINSICS: extrinsics,
+        f"{keys.STATE}_is_pad": torch.tensor([[i < pads for i in range(T)] for pads in PADS]),
+    }
+    for k, camera in enumerate(CAMERAS):
+        batch |= {keys.rgb_key(camera): rgb[:, :, k], keys.depth_key(camera): 1000 * depth[:, :, k, None]}
+    return batch
+
+
+def test_only_real_rows_are_kept_in_order() -> None:
+    batch = window_batch()
+    window = read_window(batch, CAMERAS)
+    real = ~batch[f"{keys.STATE}_is_pad"]
+    assert window.real.equal(real)
+    rows = [(b, t) for b in range(B) for t in range(PADS[b], T)]
+    assert len(window.tool) == len(rows) == real.sum()
+    for n, (b, t) in enumerate(rows):
+        assert window.tool[n].equal(batch[keys.STATE][b, t, :3])
+        assert window.action[n].equal(batch[keys.ACTION][b, t])
+        for k, camera in enumerate(CAMERAS):
+            assert window.rgb[n, k].equal(batch[keys.rgb_key(camera)][b, t])
+            torch.testing.assert_close(window.depth[n, k], batch[keys.depth_key(camera)][b, t, 0] / 1000)
+
+
+def test_padding_rows_have_no_influence_on_the_window() -> None:
+    batch, spoiled = window_batch(), window_batch()
+    padded = spoiled[f"{keys.STATE}_is_pad"]
+    for key, values in spoiled.items():
+        if not key.endswith("_is_pad"):
+            values[padded] = torch.nan
+    first, second = read_window(batch, CAMERAS), read_window(spoiled, CAMERAS)
+    assert all(
+        getattr(first, name).equal(getattr(second, name)) for name in ("rgb", "depth", "intrinsics", "tool", "action")
+    )
+
+
+def test_calibration_is_unpacked_camera_by_camera() -> None:
+    window = read_window(window_batch(), CAMERAS)
+    intrinsics, extrinsics = cameras_around(K)
+    assert window.intrinsics.equal(intrinsics.expand_as(window.intrinsics))
+    assert window.extrinsics.equal(extrinsics.expand_as(window.extrinsics))
+
+
+def test_single_observations_are_windows_of_one_step() -> None:
+    batch = {key: values[:, -1] for key, values in window_batch().items() if not key.endswith("_is_pad")}
+    batch.pop(keys.ACTION)
+    window = read_window(batch, CAMERAS)
+    assert window.real.shape == (B, 1)
+    assert window.real.all()
+    assert window.rgb.shape == (B, K, 3, *SIZE)
+    assert window.action is None
+
+
+def test_views_come_in_the_policy_s_order() -> None:
+    batch = window_batch()
+    assert read_window(batch, CAMERAS[::-1]).rgb.equal(read_window(batch, CAMERAS).rgb.flip(1))
+
+
+@pytest.mark.parametrize("key", [keys.rgb_key, keys.depth_key])
+def test_missing_view_is_named(key: Any) -> None:
+    batch = window_batch()
+    del batch[key("wrist")]
+    with pytest.raises(ValueError, match=rf"{key('wrist')}.*\['front', 'wrist'\]"):
+        read_window(batch, CAMERAS)
+
+
+def test_heat_is_1_now_decays_with_age_and_is_0_for_the_future() -> None:
+    heat = causal_heat(torch.arange(-3, 4))
+    assert heat[:3].eq(0).all()
+    assert heat[3] == 1
+    assert (heat[3:].diff() < 0).all()
+    assert (heat[3:] > 0).all()
+
+
+def test_each_row_sees_the_tool_now_and_before_and_never_the_future() -> None:
+    batch = window_batch()
+    window = read_window(batch, CAMERAS)
+    seen = window.observe(torch.zeros(B, 2))
+    rows = [(b, t) for b in range(B) for t in range(PADS[b], T)]
+    for n, (b, t) in enumerate(rows):
+        drawn = {tuple(seen.tool[n, p].tolist()): seen.heat[n, p].item() for p in range(T) if seen.heat[n, p] > 0}
+        ages = {tuple(batch[keys.STATE][b, past, :3].tolist()): t - past for past in range(PADS[b], t + 1)}
+        assert set(drawn) == set(ages), "real steps up to now, and no other"
+        torch.testing.assert_close(
+            torch.tensor([drawn[tool] for tool in ages]),
+            causal_heat(torch.tensor(list(ages.values()))),
+            atol=1e-6,
+            rtol=0,
+        )
+
+
+def test_each_row_gets_the_instruction_of_its_window() -> None:
+    text = torch.arange(B, dtype=torch.float32)[:, None]
+    seen = read_window(window_batch(), CAMERAS).observe(text)
+    assert seen.text[:, 0].tolist() == [0] * 5 + [1] * 3 + [2]
+
+
+def moved_window() -> tuple[Window, Window, torch.Tensor]:
+    window = read_window(window_batch(), CAMERAS)
+    torch.manual_seed(0)
+    motion, turn = random_world_motion(B, AugmentConfig(yaw=1.0, shift=0.3), torch.tensor([0.4, 0.0, 0.3]))
+    return window, window.moved(motion, turn), motion[window.real.nonzero()[:, 0]]
+
+
+def test_world_motion_keeps_the_projections_of_tool_and_target() -> None:
+    window, moved, _ = moved_window()
+    for before, after in ((window.tool, moved.tool), (window.action[:, :3], moved.action[:, :3])):
+        expected, z = project(before[:, None], window.intrinsics, window.extrinsics)
+        found, z_moved = project(after[:, None], moved.intrinsics, moved.extrinsics)
+        ahead = z > 0.05
+        torch.testing.assert_close(z_moved, z, atol=1e-5, rtol=0)
+        torch.testing.assert_close(found[ahead], expected[ahead], atol=5e-2, rtol=1e-4)
+
+
+def test_world_motion_turns_the_target_with_the_world_and_keeps_the_gripper() -> None:
+    window, moved, motion = moved_window()
+    before, after = (
+        Rotation.from_quat(w.action[:, 3:7].numpy(), scalar_first=True).as_matrix() for w in (window, moved)
+    )
+    torch.testing.assert_close(torch.from_numpy(after).float(), motion[:, :, :3] @ torch.from_numpy(before).float())
+    torch.testing.assert_close(moved.action[:, 3:7].norm(dim=1), torch.ones(len(moved.action)))
+    assert moved.action[:, 7].equal(window.action[:, 7])
+    assert moved.rgb is window.rgb
+
+
+def test_all_steps_of_a_window_move_together() -> None:
+    window, moved, _ = moved_window()
+    before, after = (torch.cdist(w.tool[:5], w.tool[:5]) for w in (window, moved))
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+
+
+def test_distortion_changes_images_but_no_pose_and_not_the_original() -> None:
+    window = read_window(window_batch(), CAMERAS)
+    kept = window.rgb.clone(), window.depth.clone(), window.intrinsics.clone()
+    distorted = window.distorted(AugmentConfig(depth_noise=0.01))
+    assert not distorted.rgb.equal(window.rgb)
+    assert not distorted.depth.equal(window.depth)
+    assert distorted.tool is window.tool
+    assert distorted.action is window.action
+    assert all(now.equal(then) for now, then in zip((window.rgb, window.depth, window.intrinsics), kept, strict=True))
