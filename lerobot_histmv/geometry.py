@@ -45,7 +45,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Float[np.ndarray, "... 3 3"
 def angle_between(first: ArrayLike, second: ArrayLike) -> Float[np.ndarray, "..."]:
     """Angle [rad] in [0, pi] between rotations given as unit quaternions (..., 4)."""
     dot = np.abs(np.sum(np.asarray(first) * np.asarray(second), axis=-1))
-    return 2 * np.arccos(np.clip(dot, 0, 1))
+    return np.asarray(2 * np.arccos(np.clip(dot, 0, 1)))
 
 
 def deproject(
