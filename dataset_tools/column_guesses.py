@@ -61,7 +61,9 @@ def resolve(features: Features, config: ColumnsConfig) -> Columns:
     curve = parse(features, config.position, "position") if config.position else _position(features)
     if len(curve.indices) != 3:
         raise ValueError(f"columns.position is {curve}, {len(curve.indices)} entries; it must be x, y, z")
-    return Columns(curve, False, *_rotation(features, config, curve.feature), gripper, ends)
+    rotation, rotation_format = _rotation(features, config, curve.feature)
+    commanded = _commanded(features) if config.commanded and rotation else None
+    return Columns(curve, False, rotation, rotation_format, gripper, ends, commanded)
 
 
 def _position(features: Features) -> Column:
@@ -116,6 +118,18 @@ def _told_rotation(features: Features, text: str, rotation_format: str | None) -
             f"{ROTATION_FORMATS[rotation_format]}"
         )
     return column, rotation_format
+
+
+def _commanded(features: Features) -> tuple[Column, Column] | None:
+    """Position and rotation in an action that bears our own pose names, and so is absolute and in w, x, y, z."""
+    names = entry_names(features[keys.ACTION]) if keys.ACTION in features else ()
+    if not set(keys.POSE_NAMES) <= set(names):
+        return None
+    position, rotation = (
+        Column(keys.ACTION, tuple(names.index(name) for name in wanted), wanted)
+        for wanted in (keys.POSITION_NAMES, keys.QUATERNION_NAMES)
+    )
+    return position, rotation
 
 
 def _gripper(features: Features, config: ColumnsConfig) -> Column | None:

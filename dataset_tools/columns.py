@@ -33,6 +33,9 @@ class ColumnsConfig:
     gripper: str | None = None
     # Gripper values that mean closed and open, e.g. [0,100]. Default: [0,1] under our own names, else the data's range.
     gripper_range: list[float] | None = None
+    # Where the arm rests, label with the commanded pose, not the measured one, if the action has our pose names: an arm
+    # that pushes against something does not get to where it was told to go.
+    commanded: bool = True
     # Joint angles [rad] to follow instead of a tool position, e.g. observation.state:0:6 . epsilon is then in radians.
     joints: str | None = None
 
@@ -75,6 +78,7 @@ class Columns:
         rotation_format: one of ``ROTATION_FORMATS``; empty without rotation.
         gripper: gripper command, if there is one.
         gripper_range: its values that mean closed and open; None where only the data tell.
+        commanded: commanded tool position and rotation (w, x, y, z), if they are to be used.
     """
 
     curve: Column
@@ -83,12 +87,15 @@ class Columns:
     rotation_format: str
     gripper: Column | None
     gripper_range: tuple[float, float] | None
+    commanded: tuple[Column, Column] | None = None
 
     def chosen(self) -> dict[str, str]:
         """What was chosen, as text."""
         named = {"joints" if self.is_joints else "position": self.curve, "gripper": self.gripper}
         if self.rotation:
             named[f"rotation ({self.rotation_format})"] = self.rotation
+        if self.commanded:
+            named["commanded position"], named["commanded rotation"] = self.commanded
         return {name: str(column) for name, column in named.items() if column}
 
 

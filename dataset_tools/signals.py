@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lerobot_histmv.geometry import angle_between
 
@@ -25,12 +25,16 @@ class Trajectory:
         fps: frames per second.
         quaternion: tool rotation, unit w, x, y, z (n, 4); None if not recorded.
         gripper: command in force from each frame on, 1 open, 0 closed (n,); None without a gripper.
+        commanded_position: where the tool was told to be at each frame [m] (n, 3); None if the action does not say.
+        commanded_quaternion: and how turned, unit w, x, y, z (n, 4).
     """
 
     position: Float[np.ndarray, "n d"]
     fps: float
     quaternion: Float[np.ndarray, "n 4"] | None = None
     gripper: Float[np.ndarray, " n"] | None = None
+    commanded_position: Float[np.ndarray, "n 3"] | None = None
+    commanded_quaternion: Float[np.ndarray, "n 4"] | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -43,6 +47,11 @@ class Keyframe:
     pose_frame: int
     observation_frame: int
     reason: str
+
+    @property
+    def rests(self) -> bool:
+        """Whether the arm stands still here, rather than passing through."""
+        return self.observation_frame > self.pose_frame
 
 
 @dataclass(frozen=True)
@@ -68,15 +77,14 @@ class PauseOptions:
 
 
 def pauses(trajectory: Trajectory, options: PauseOptions) -> list[Span]:
-    """Spans of frames during which the tool stands still, in order, not touching each other.
+    """Spans of frames during which the tool stands still, or is told to, in order, not touching each other.
 
     A step between two frames is still if it, and most of its neighbourhood of three, is slower than the thresholds: one
-    noisy step does not split a pause.
+    noisy step does not split a pause. The commanded motion counts too: an arm that pushes against something creeps.
     """
-    still = _median3(np.linalg.norm(np.diff(trajectory.position, axis=0), axis=-1)) * trajectory.fps < options.speed
-    if trajectory.quaternion is not None:
-        turn = angle_between(trajectory.quaternion[1:], trajectory.quaternion[:-1])
-        still &= _median3(turn) * trajectory.fps < options.turn_speed
+    still = _still(trajectory.position, trajectory.quaternion, trajectory.fps, options)
+    if trajectory.commanded_position is not None:
+        still |= _still(trajectory.commanded_position, trajectory.commanded_quaternion, trajectory.fps, options)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     shortest = max(1, round(options.dwell * trajectory.fps))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= shortest]
@@ -126,6 +134,16 @@ def _resting_frame(trajectory: Trajectory, begin: int, end: int, options: PauseO
     position = trajectory.position[begin : end + 1]
     away = np.linalg.norm(position - np.median(position, axis=0), axis=-1)
     return begin + int(np.argmax(away <= max(options.speed / trajectory.fps, away.min())))
+
+
+def _still(
+    position: Float[np.ndarray, "n d"], quaternion: Float[np.ndarray, "n 4"] | None, fps: float, options: PauseOptions
+) -> Bool[np.ndarray, " steps"]:
+    """Which steps from one frame to the next are slower than the thresholds."""
+    still = _median3(np.linalg.norm(np.diff(position, axis=0), axis=-1)) * fps < options.speed
+    if quaternion is not None:
+        still &= _median3(angle_between(quaternion[1:], quaternion[:-1])) * fps < options.turn_speed
+    return still
 
 
 def _median3(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

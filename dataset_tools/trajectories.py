@@ -1,6 +1,6 @@
 """Tool motion and action labels out of an episode's columns: one quaternion order, one meaning of the gripper."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -44,11 +44,20 @@ def trajectory_of(vectors: Vectors, columns: Columns, ends: GripperEnds, fps: fl
     Raises:
         ValueError: a quaternion that is not unit; the message names episode and frame.
     """
+    commanded_position = commanded_quaternion = None
+    if columns.commanded:
+        position, rotation = columns.commanded
+        commanded_position = _one_later(position.of(vectors))
+        commanded_quaternion = _one_later(_quaternion(rotation, "wxyz", vectors, episode))
     return Trajectory(
         position=columns.curve.of(vectors),
         fps=fps,
-        quaternion=_quaternion(columns.rotation, columns.rotation_format, vectors, episode),
+        quaternion=_quaternion(columns.rotation, columns.rotation_format, vectors, episode)
+        if columns.rotation
+        else None,
         gripper=command(columns.gripper.of(vectors)[:, 0], ends) if columns.gripper else None,
+        commanded_position=commanded_position,
+        commanded_quaternion=commanded_quaternion,
     )
 
 
@@ -94,23 +103,31 @@ def label_names(columns: Columns) -> list[str]:
     return [*names, keys.GRIPPER_NAME] if columns.gripper else names
 
 
-def labels(trajectory: Trajectory, keyframes: Iterable[Keyframe]) -> Float32[np.ndarray, "k a"]:
-    """Measured pose at each pose frame, and the gripper command in force from then on."""
+def labels(trajectory: Trajectory, keyframes: Sequence[Keyframe]) -> Float32[np.ndarray, "k a"]:
+    """Pose at each pose frame, and the gripper command in force from then on.
+
+    The pose is the measured one; where the arm rests, the commanded one if there is one.
+    """
     frames = [keyframe.pose_frame for keyframe in keyframes]
+    rests = np.array([keyframe.rests for keyframe in keyframes])[:, None]
     parts = [trajectory.position[frames]]
     if trajectory.quaternion is not None:
         parts.append(trajectory.quaternion[frames])
+    if trajectory.commanded_position is not None and trajectory.commanded_quaternion is not None:
+        told = (trajectory.commanded_position[frames], trajectory.commanded_quaternion[frames])
+        parts = [np.where(rests, commanded, measured) for commanded, measured in zip(told, parts, strict=True)]
     if trajectory.gripper is not None:
         parts.append(trajectory.gripper[frames, None])
     return np.hstack(parts).astype(np.float32)
 
 
-def _quaternion(
-    column: Column | None, rotation_format: str, vectors: Vectors, episode: int
-) -> Float[np.ndarray, "n 4"] | None:
+def _one_later(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """What was commanded for each frame: an action leads to the frame after it."""
+    return np.concatenate([values[:1], values[:-1]])
+
+
+def _quaternion(column: Column, rotation_format: str, vectors: Vectors, episode: int) -> Float[np.ndarray, "n 4"]:
     """Canonical unit quaternions w, x, y, z."""
-    if column is None:
-        return None
     values = column.of(vectors)
     if rotation_format in ("rotvec", "rpy"):
         turn = Rotation.from_rotvec(values) if rotation_format == "rotvec" else Rotation.from_euler("xyz", values)
