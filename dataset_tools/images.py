@@ -13,15 +13,14 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 _QUANTILE_BINS = 5000
 _MIN_SAMPLES, _MAX_SAMPLES, _SAMPLING_POWER = 100, 10_000, 0.75
 _FULL_SIZE_BELOW, _REDUCED_SIZE = 300, 150
-_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 _TIFF_UNCOMPRESSED = (cv2.IMWRITE_TIFF_COMPRESSION, 1)
 
 Images = UInt8[np.ndarray, "n y x 3"] | UInt16[np.ndarray, "n y x 1"]
 
 
 def encode_rgb(image_yxc: UInt8[np.ndarray, "y x 3"]) -> bytes:
-    """PNG file of a colour image."""
-    return _encode(".png", np.ascontiguousarray(image_yxc[..., ::-1]), _PNG)
+    """PNG file of a colour image; OpenCV's default compression is its fastest."""
+    return _encode(".png", cv2.cvtColor(image_yxc, cv2.COLOR_RGB2BGR))
 
 
 def encode_depth(depth_yxc: UInt16[np.ndarray, "y x 1"]) -> bytes:
@@ -54,7 +53,7 @@ def image_statistics(images_nyxc: Images) -> dict[str, np.ndarray]:
     return statistics | {"count": np.array([len(sampled_nyxc)])}
 
 
-def _encode(suffix: str, image: np.ndarray, options: tuple[int, ...]) -> bytes:
+def _encode(suffix: str, image: np.ndarray, options: tuple[int, ...] = ()) -> bytes:
     done, encoded = cv2.imencode(suffix, image, options)
     assert done, f"OpenCV could not encode a {suffix} image of shape {image.shape}"
     return encoded.tobytes()

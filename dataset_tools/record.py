@@ -19,7 +19,7 @@ from dataset_tools.record_settings import SEED_LIMIT, RecordSettings
 from dataset_tools.record_worker import WorkerSetup
 from dataset_tools.shards import Outcome, made_attempts, missing_attempts, read_outcomes, write_json
 from lerobot_histmv.envs import TASKS, make
-from lerobot_histmv.envs.ur5 import CAMERA_NAMES
+from lerobot_histmv.envs.interface import CAMERA_NAMES, check_options
 
 
 @dataclass
@@ -28,12 +28,12 @@ class RecordEnvConfig:
 
     # The environment type; only this one has scripted experts.
     type: str = "ur5"
-    # The task to demonstrate.
+    # The task to demonstrate: pick_and_lift, push_buttons or reach_target.
     task: str = ""
     # Index of the variation to record; by default each episode's seed draws one.
     variation: int | None = None
-    # Cameras, separated by commas.
-    cameras: str = ",".join(CAMERA_NAMES)
+    # Cameras to record, in this order: a list such as [front,wrist].
+    cameras: list[str] = field(default_factory=lambda: list(CAMERA_NAMES))
     # Side of the square images, in pixels.
     image_size: int = 128
 
@@ -67,14 +67,14 @@ def run(config: RecordConfig) -> None:
     """
     settings = checked_settings(config)
     repo_id = config.repo_id or f"local/ur5_{settings.task}"
-    make_env = partial(
-        make,
-        settings.task,
-        cameras=settings.cameras,
-        image_size=settings.image_size,
-        variation=settings.variation,
-    )
-    make_env()  # refuses impossible settings; builds nothing yet
+    options = {
+        "cameras": settings.cameras,
+        "image_size": settings.image_size,
+        "render_size": settings.image_size,
+        "variation": settings.variation,
+    }
+    check_options(settings.task, **options)
+    make_env = partial(make, settings.task, **options)
     root = Path(config.root).expanduser() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
     recorder.record(config.episodes, config.workers)
@@ -94,7 +94,7 @@ def checked_settings(config: RecordConfig) -> RecordSettings:
     return RecordSettings(
         task=config.env.task,
         variation=config.env.variation,
-        cameras=tuple(camera.strip() for camera in config.env.cameras.split(",")),
+        cameras=tuple(config.env.cameras),
         image_size=config.env.image_size,
         fps=config.fps,
         seed=config.seed,

@@ -64,6 +64,7 @@ class RecordPlace:
             ValueError: another process holds it, or it belongs to a recording with other settings.
         """
         self.parts.mkdir(parents=True, exist_ok=True)
+        self._refuse_foreign()
         lock = FileLock(self.parts / _LOCK)
         try:
             lock.acquire(timeout=0)
@@ -74,6 +75,11 @@ class RecordPlace:
             yield self.parts
         finally:
             lock.release()
+
+    def _refuse_foreign(self) -> None:
+        names = {path.name for path in self.parts.iterdir() if path.suffix != ".tmp"}
+        if names - {_LOCK} and _SETTINGS not in names:
+            raise ValueError(f"{self.parts} exists and was not made by a recording; choose another root")
 
     def _take_over(self) -> None:
         settings_file = self.parts / _SETTINGS
@@ -86,8 +92,6 @@ class RecordPlace:
                 if not self._overwrite:
                     raise
                 self._clear()
-        elif any(path.name != _LOCK and path.suffix != ".tmp" for path in self.parts.iterdir()):
-            raise ValueError(f"{self.parts} exists and was not made by a recording; choose another root")
         write_json(settings_file, self._settings.as_json())
 
     def _clear(self) -> None:

@@ -22,8 +22,6 @@ from dataset_tools.images import encode_depth, encode_rgb, image_statistics
 from dataset_tools.shards import Outcome, write_failure, write_success
 from lerobot_histmv import keys
 
-_IMAGE_CELL = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-
 
 @dataclass(frozen=True)
 class WorkerSetup:
@@ -125,10 +123,21 @@ def episode_table(columns: Mapping[str, np.ndarray]) -> pa.Table:
 
 def _arrow_column(key: str, column: np.ndarray) -> pa.Array:
     if column.ndim == 2:
-        return pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
+        numbers = pa.py_buffer(np.ascontiguousarray(column, np.float32))
+        values = pa.Array.from_buffers(pa.float32(), column.size, [None, numbers])
+        return pa.FixedSizeListArray.from_arrays(values, column.shape[1])
     encode, suffix = (encode_depth, "tiff") if key.endswith(keys.DEPTH_SUFFIX) else (encode_rgb, "png")
-    cells = [{"bytes": encode(image), "path": f"frame-{i:06d}.{suffix}"} for i, image in enumerate(column)]
-    return pa.array(cells, type=_IMAGE_CELL)
+    files = _arrow_strings([encode(image) for image in column], pa.binary())
+    names = _arrow_strings([f"frame-{i:06d}.{suffix}".encode() for i in range(len(column))], pa.string())
+    return pa.StructArray.from_arrays([files, names], ["bytes", "path"])
+
+
+def _arrow_strings(cells: Sequence[bytes], arrow_type: pa.DataType) -> pa.Array:
+    """Made from buffers, because ``pa.array`` would import pandas, which takes seconds in every process."""
+    offsets = np.cumsum([0, *map(len, cells)])
+    assert offsets[-1] < 2**31, f"{offsets[-1]} bytes exceed an Arrow column"
+    buffers = [None, pa.py_buffer(offsets.astype(np.int32)), pa.py_buffer(b"".join(cells))]
+    return pa.Array.from_buffers(arrow_type, len(cells), buffers)
 
 
 _workers: list[Worker] = []
