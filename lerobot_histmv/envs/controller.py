@@ -69,7 +69,7 @@ class Controller:
         return None
 
     def execute(self, motion: Motion) -> bool:
-        """Move, arrive, drive the gripper if its command changes, dwell. False (and the arm stays) if out of reach."""
+        """Move, arrive, drive the gripper if its command changes, dwell. False (the arm stays) if out of reach."""
         plan = self.plan(motion.via, motion.target, motion.speed)
         if plan is not None and self.follow(plan):
             self._arrive(motion.target)
@@ -80,7 +80,7 @@ class Controller:
         return plan is not None
 
     def servo(self, target: Pose, gripper: float) -> bool:
-        """One tick towards ``target``, no joint faster than ``MAX_JOINT_SPEED``. False (and the arm stays) if out of reach."""
+        """One tick towards ``target``, no joint above ``MAX_JOINT_SPEED``. False (the arm stays) if out of reach."""
         self.gripper = gripper
         goal = self._simulation.kinematics.solve(target, self.reference)
         change = np.zeros(6) if goal is None else goal - self.reference

@@ -21,6 +21,8 @@ REACH_HIGH = np.array([0.75, 0.45, 0.60])
 """Commanded positions [m] are clipped to this box."""
 ACTION_SIZE = len(keys.POSE_NAMES)
 STATE_SIZE = ACTION_SIZE + 6
+MAX_JOINT = 6.4
+"""Bound of the measured joint angles [rad], a little beyond the mechanical limit."""
 
 
 def check_options(
@@ -67,18 +69,15 @@ def action_space() -> spaces.Box:
 
 
 def observation_space(cameras: Sequence[str], size: int) -> spaces.Dict:
-    """Shapes and types of an observation; see ``UR5Env``."""
-
-    def floats(count: int) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (count,), np.float32)
-
+    """Shapes, types and bounds of an observation; see ``UR5Env``."""
     pixels = spaces.Dict({camera: spaces.Box(0, 255, (size, size, 3), np.uint8) for camera in cameras})
     depths = {f"{camera}{keys.DEPTH_SUFFIX}": spaces.Box(0, 65535, (size, size, 1), np.uint16) for camera in cameras}
     calibration = {
-        "camera_intrinsics": floats(len(keys.intrinsics_names(cameras))),
-        "camera_extrinsics": floats(len(keys.extrinsics_names(cameras))),
+        "camera_intrinsics": spaces.Box(0, 1e4, (len(keys.intrinsics_names(cameras)),), np.float32),
+        "camera_extrinsics": spaces.Box(-5, 5, (len(keys.extrinsics_names(cameras)),), np.float32),
     }
-    return spaces.Dict({"pixels": pixels, "agent_pos": floats(STATE_SIZE), **depths, **calibration})
+    state = np.array([*[2] * 3, *[1] * 5, *[MAX_JOINT] * 6], np.float32)
+    return spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-state, state), **depths, **calibration})
 
 
 def parse_action(action: Float[np.ndarray, " 8"]) -> tuple[Pose, float]:

@@ -28,7 +28,7 @@ SAMPLES_PER_SEGMENT = 64
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of the tool (the pinch point between the finger pads, z towards the object) in the base frame.
+    """Pose of the tool (the pinch point between the finger pads, z from there to the wrist) in the base frame.
 
     Args:
         position: x, y, z [m], shape (3,).
@@ -40,12 +40,12 @@ class Pose:
 
     def raised(self, height: float) -> "Pose":
         """The same pose ``height`` [m] further up."""
-        return Pose(self.position + [0, 0, height], self.quaternion)
+        return Pose(self.position + np.array([0, 0, height]), self.quaternion)
 
 
 def top_down(position: ArrayLike, yaw: float = 0.0) -> Pose:
-    """Tool pose that points straight down, its fingers apart along the y axis turned by ``yaw`` [rad] about world z."""
-    quaternion = canonical([0.0, np.cos(yaw / 2), np.sin(yaw / 2), 0.0])
+    """Pose of a gripper that points straight down, its fingers apart along the y axis turned by ``yaw`` [rad]."""
+    quaternion = canonical([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     return Pose(np.asarray(position, dtype=np.float64), quaternion)
 
 
@@ -97,7 +97,7 @@ def _round_corner(
     positions: Float[np.ndarray, "n 3"], tau: Float[np.ndarray, " n"], corners: Float[np.ndarray, "c 3"], at: int
 ) -> None:
     """Replace the polyline around ``corners[at]`` by a quadratic Bezier curve, in place."""
-    before, after = (np.linalg.norm(corners[at] - corners[at + step]) for step in (-1, 1))
+    before, after = (float(np.linalg.norm(corners[at] - corners[at + step])) for step in (-1, 1))
     radius = min(BLEND_RADIUS, before / 2, after / 2)
     if radius < 1e-6:
         return

@@ -11,7 +11,10 @@ from lerobot_histmv.envs import assets
 FOLDER = Path(__file__).parent
 ARM_PREFIX = "arm_"
 GRIPPER_PREFIX = "gripper_"
-TOOL_SITE = "gripper_pinch"
+TOOL_SITE = "gripper_tool"
+TOOL_IN_GRIPPER = (0.0, 1.0, 0.0, 0.0)
+"""Half a turn about x: a gripper that points down has its tool axes along the base's. Otherwise the usual poses would
+lie where w = 0, and noise would flip the sign of their canonical quaternions."""
 PADS = {
     "left": ("gripper_left_pad1", "gripper_left_pad2"),
     "right": ("gripper_right_pad1", "gripper_right_pad2"),
@@ -29,8 +32,8 @@ def build_model(objects: Mapping[str, str], render_size: int) -> mujoco.MjModel:
     """Compile the scene.
 
     Args:
-        objects: object name -> its description in ``objects/<description>.xml``; an element ``x`` of that file is called
-            ``<name>_x`` in the model.
+        objects: object name -> its description in ``objects/<description>.xml``; an element ``x`` of that file is
+            called ``<name>_x`` in the model.
         render_size: largest width and height [pixels] that will be rendered.
     """
     scene = mujoco.MjSpec.from_file(str(FOLDER / "scene.xml"))
@@ -62,13 +65,14 @@ def arm_spec() -> mujoco.MjSpec:
 
 
 def _gripper_spec() -> mujoco.MjSpec:
-    """The gripper with decimated meshes, boxes and a cylinder for collisions, and the wrist camera."""
+    """The gripper with decimated meshes, boxes and a cylinder for collisions, tool site and wrist camera."""
     gripper = mujoco.MjSpec.from_file(str(assets.menagerie() / assets.GRIPPER))
     _use_meshes(gripper, assets.decimated_meshes() / assets.GRIPPER.parent)
     for geom in list(gripper.geoms):
         if geom.classname.name == "collision" and geom.type == mujoco.mjtGeom.mjGEOM_MESH:
             gripper.delete(geom)
     base = gripper.body("base")
+    base.add_site(name="tool", pos=gripper.site("pinch").pos, quat=TOOL_IN_GRIPPER, group=5)
     base.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.036, 0.045, 0], pos=[0, 0, 0.045], group=3)
     for material in gripper.materials:
         if material.name in GRIPPER_COLORS:

@@ -1,7 +1,7 @@
 """The gymnasium environment around a task, a simulation and its cameras."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -26,7 +26,8 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
     """A UR5e with a Robotiq 2F-85 at a table, doing one of ``TASKS``.
 
     Frame: the robot's base (ROS ``base_link``) = world, metres, z up, table top at z = 0. The tool is the pinch point
-    between the finger pads; its z axis points where the gripper points, its y axis from finger to finger.
+    between the finger pads; its z axis points back to the wrist, its y axis from finger to finger, so that a gripper
+    pointing down has the quaternion (cos(yaw / 2), 0, 0, sin(yaw / 2)).
 
     **Action**, float32 (8,), absolute:
 
@@ -38,12 +39,13 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
     | 3 to 6 | ee.qw.pos, ee.qx.pos, ee.qy.pos, ee.qz.pos | tool target quaternion, normalised here | -1 | 1 | |
     | 7 | gripper.pos | gripper command: above 0.5 open, else closed | 0 | 1 | |
 
-    With ``control="macro"`` a step is a macro step: the tool moves to the target in a straight line with the gripper as it
-    is (where that crosses a singularity, in a straight line in joint space), then the gripper takes its command (0.5 s, if it
-    changed), then the arm rests for 0.1 s. With ``control="servo"`` a step is one tick of 50 ms towards the target, no joint
-    faster than 180 degrees per second. Positions outside the box are clipped to it. A pose that the arm cannot reach
-    leaves the arm where it is. An arm that is blocked stops (protective stop) and the step ends. An action of another shape, with
-    a number that is not finite or a quaternion of length 0 raises ValueError.
+    With ``control="macro"`` a step is a macro step: the tool moves to the target in a straight line with the gripper as
+    it is (where that crosses a singularity, in a straight line in joint space), then the gripper takes its command
+    (0.5 s, if it changed), then the arm rests for 0.1 s. With ``control="servo"`` a step is one tick of 50 ms towards
+    the target, no joint faster than 180 degrees per second. Positions outside the box are clipped to it. A pose that
+    the arm cannot reach leaves the arm where it is; the gripper still takes its command. An arm that is blocked stops
+    (protective stop) and the step ends. An action of another shape, with a number that is not finite or a quaternion
+    of length 0 raises ValueError.
 
     **Observation**, for n = ``image_size`` and K ``cameras``:
 
@@ -51,31 +53,31 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
     |---|---|---|
     | pixels/<camera> | uint8 (n, n, 3) | colour |
     | <camera>_depth | uint16 (n, n, 1) | distance along the optical axis [mm], 0 = none |
-    | agent_pos | float32 (14,) | measured tool pose (7 as in the action), gripper opening (1 open), joint angles [rad] (6) |
+    | agent_pos | float32 (14,) | measured tool pose (7), gripper opening (1 open), joint angles [rad] (6) |
     | camera_intrinsics | float32 (4 K) | fx fy cx cy [pixels] of each camera |
     | camera_extrinsics | float32 (12 K) | rows of the 3x4 T_world_cam of each camera |
 
     Cameras: front and left_shoulder are fixed, wrist moves with the gripper.
 
-    **Tasks.** Objects lie in x 0.3 to 0.6, y -0.28 to 0.28 [m]; target and distractors differ in colour (red, green, blue,
-    yellow, purple, cyan).
+    **Tasks.** Each scene has three objects in x 0.3 to 0.6, y -0.28 to 0.28 [m], of different colours out of red,
+    green, blue, yellow, purple and cyan.
 
-    | task | scene | success | variations | expert's macro steps |
+    | task | objects | success | variations | macro steps of the expert |
     |---|---|---|---|---|
-    | reach_target | 3 spheres 5 to 20 cm up | tool within 2 cm of the named sphere's centre | 6 colours | 2 |
-    | push_buttons | 3 buttons, >= 14 cm apart | the named 1 to 3 pressed (3 mm) in order, no other | 18 sequences | 2 per button |
-    | pick_and_lift | 3 cubes of 4 cm, any yaw, >= 10 cm apart | both pads touch the named cube, its centre above 0.2 m | 6 colours | 4 |
+    | reach_target | spheres, 5 to 20 cm up | tool within 2 cm of the named centre | 6 | 2 |
+    | push_buttons | buttons, >= 14 cm apart | the named 1 to 3 pressed in order, no other | 18 | 2 per button |
+    | pick_and_lift | 4 cm cubes, any yaw, >= 10 cm apart | named cube in both pads, above 0.2 m | 6 | 4 |
 
-    Success is judged when a step ends (what was pressed is remembered from every tick). Reward: 1 on success, else 0.
+    Success is judged when a step ends; what was pressed is remembered from every tick. Reward: 1 on success, else 0.
     **End**: ``terminated`` at success; ``truncated`` after twice the expert's macro steps (servo: 40 ticks for each).
 
-    **Reset.** The tool is at (0.28, 0, 0.40), pointing down; the gripper is open, but closed in push_buttons, where it is the
-    pushing tool. The seed alone decides variation, instruction and scene (``options={"variation": i}`` or the argument fixes the
-    variation, and nothing else changes but the colours). Seeds below 100,000 are for recording, up to 199,999 for evaluation during
-    training, from 200,000 for reported results.
+    **Reset.** The tool is at (0.28, 0, 0.40), pointing down; the gripper is open, but closed in push_buttons, where it
+    is the pushing tool. The seed alone decides variation, instruction and scene; fixing the variation by argument or
+    by ``options={"variation": i}`` leaves the objects' places as they are. Seeds below 100,000 are for recording, those
+    up to 199,999 for evaluation during training, those from 200,000 for reported results.
 
-    **Info**: ``is_success`` bool, ``instruction``, ``variation``, ``ticks`` (control periods so far) and ``failure``: empty until
-    an episode is truncated, then the first that holds of
+    **Info**: ``is_success`` bool, ``instruction`` str, ``variation`` int, ``ticks`` (control periods so far) and
+    ``failure``: empty until an episode is truncated, then the first that holds of
 
     | failure | meaning |
     |---|---|
@@ -96,7 +98,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         render_size: side of what ``render`` and ``substep_frames`` return [pixels].
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(interface.RENDER_MODES), "render_fps": 20}
+    metadata = {"render_modes": list(interface.RENDER_MODES), "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -244,7 +246,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         return self.stage.renderer.render(self.stage.simulation.data, "front", self.render_size)[0]
 
     def substep_frames(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """What ``render`` showed at every tick of the last step, or after the last reset; empty unless ``record_substeps``."""
+        """What ``render`` showed after each tick of the last step or after reset; empty unless ``record_substeps``."""
         return list(self._frames)
 
     def _capture(self) -> None:

@@ -32,8 +32,8 @@ WORKSPACE = np.array([[0.3, 0.6], [-0.28, 0.28]])
 class Task(ABC):
     """One task; an instance holds the state of one episode.
 
-    A variation is what the instruction asks for: a sequence of colours, in order. ``slots`` maps the named colours, then the
-    distractors, to the objects of the scene. Subclasses set the class variables and the abstract methods.
+    A variation is what the instruction asks for: a sequence of colours, in order. ``slots`` lists the scene's objects:
+    those of the named colours, in order, then the distractors.
     """
 
     name: ClassVar[str]
@@ -44,16 +44,15 @@ class Task(ABC):
     """Gripper command at the start: 1 open, 0 closed."""
 
     def reset(self, simulation: "Simulation", variation: int, rng: np.random.Generator) -> None:
-        """Colour and place all objects and forget the last episode. ``rng`` alone decides what the variation leaves open."""
+        """Colour and place all objects and forget the last episode; ``rng`` decides what the variation leaves open."""
         self.goal = self.variations[variation]
-        others = [color for color in COLORS if color not in self.goal]
-        distractors = rng.choice(len(others), len(self.objects) - len(self.goal), replace=False)
-        colors = [*self.goal, *(others[i] for i in distractors)]
         names = list(self.objects)
         self.slots = [names[i] for i in rng.permutation(len(names))]
-        for slot, color in zip(self.slots, colors, strict=True):
-            simulation.paint(slot, COLORS[color])
         self.place(simulation, rng)
+        others = [color for color in COLORS if color not in self.goal]
+        drawn = rng.choice(len(others), len(self.distractors), replace=False)
+        for slot, color in zip(self.slots, [*self.goal, *(others[i] for i in drawn)], strict=True):
+            simulation.paint(slot, COLORS[color])
 
     @property
     def targets(self) -> list[str]:
@@ -69,6 +68,7 @@ class Task(ABC):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Put the objects somewhere and reset the episode's own state."""
 
+    @abstractmethod
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Called after each tick with the gripper command in force."""
 

@@ -1,11 +1,11 @@
 """Pick up the cube that the instruction names and lift it."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Motion, top_down
+from lerobot_histmv.envs.motion import Motion, Pose, top_down
 from lerobot_histmv.envs.tasks.base import COLORS, Task, scatter
 
 if TYPE_CHECKING:
@@ -31,7 +31,11 @@ TEMPLATES = {
         "grab the {} block and lift it up",
         "raise the {} cube off the table",
     ),
-    "held_out": ("hoist the {} block", "get hold of the {} cube and bring it up", "the {} cube should go up in the air"),
+    "held_out": (
+        "hoist the {} block",
+        "get hold of the {} cube and bring it up",
+        "the {} cube should go up in the air",
+    ),
 }
 
 
@@ -39,7 +43,7 @@ class PickAndLift(Task):
     """After RLBench's ``pick_and_lift``. Success: both finger pads touch the target and its centre is above 0.2 m."""
 
     name = "pick_and_lift"
-    objects = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}
+    objects: ClassVar[Mapping[str, str]] = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}
     variations = tuple((color,) for color in COLORS)
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
@@ -73,7 +77,7 @@ class PickAndLift(Task):
         cube = self.targets[0]
         grasp = top_down(simulation.position(cube), _nearest_quarter_turn(simulation.yaw(cube)))
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
-        carry = type(grasp)(np.array(CARRY), grasp.quaternion)
+        carry = Pose(np.array(CARRY), grasp.quaternion)
         yield Motion(via=(grasp.raised(ABOVE),), target=carry, gripper=0.0, dwell=4)
 
     @classmethod

@@ -1,7 +1,7 @@
 """Push the buttons that the instruction names, in its order."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -41,13 +41,14 @@ TEMPLATES = {
 
 
 class PushButtons(Task):
-    """After RLBench's ``push_buttons``. Success: the named buttons were pressed in the named order, and no other button.
+    """After RLBench's ``push_buttons``. Success: the named buttons were pressed in the named order, and no other.
 
-    The arm starts with its gripper closed, which is its pushing tool. A pressed button springs back and looks as before.
+    The arm starts with its gripper closed, which is its pushing tool. A pressed button springs back and looks as
+    before.
     """
 
     name = "push_buttons"
-    objects = {"button0": "button", "button1": "button", "button2": "button"}
+    objects: ClassVar[Mapping[str, str]] = {"button0": "button", "button1": "button", "button2": "button"}
     initial_gripper = 0.0
     variations = (
         ("red",),

@@ -1,7 +1,7 @@
 """Bring the tool to the sphere that the instruction names."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class ReachTarget(Task):
     """After RLBench's ``reach_target``. Success: the tool is within 2 cm of the target's centre when a step ends."""
 
     name = "reach_target"
-    objects = {"sphere0": "sphere", "sphere1": "sphere", "sphere2": "sphere"}
+    objects: ClassVar[Mapping[str, str]] = {"sphere0": "sphere", "sphere1": "sphere", "sphere2": "sphere"}
     variations = tuple((color,) for color in COLORS)
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
