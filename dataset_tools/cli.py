@@ -10,6 +10,7 @@ import sys
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import lerobot_histmv
@@ -68,11 +69,15 @@ def runner(name: str) -> tuple[Callable[[Any], None], type]:
 
 
 def dispatch(name: str, arguments: Sequence[str]) -> None:
-    """Parse ``arguments`` as subcommand ``name``'s config and run it."""
+    """Parse ``arguments`` as subcommand ``name``'s config and run it.
+
+    A config class with a ``parse`` of its own reads what draccus alone cannot, such as LeRobot's ``--policy.path``.
+    """
     import draccus
 
     run, config_class = runner(name)
-    run(draccus.parse(config_class, args=list(arguments), prog=f"histmv {name}"))
+    parse = getattr(config_class, "parse", partial(draccus.parse, config_class))
+    run(parse(args=list(arguments), prog=f"histmv {name}"))
 
 
 def user_errors() -> tuple[type[Exception], ...]:
@@ -80,6 +85,15 @@ def user_errors() -> tuple[type[Exception], ...]:
     from draccus.utils import DraccusException
 
     return (ValueError, OSError, DraccusException)
+
+
+def reason(error: BaseException) -> BaseException:
+    """What the user should read: draccus reports only the class that refused its values, its cause tells why."""
+    from draccus.utils import DraccusException
+
+    while isinstance(error, DraccusException) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -104,5 +118,5 @@ def main(argv: Sequence[str] | None = None) -> None:
     except user_errors() as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        print(f"histmv {name}: {error}\n({TRACEBACK_VARIABLE}=1 shows where this was raised)", file=sys.stderr)
+        print(f"histmv {name}: {reason(error)}\n({TRACEBACK_VARIABLE}=1 shows where this was raised)", file=sys.stderr)
         sys.exit(1)

@@ -1,7 +1,6 @@
 """LeRobot finds the plugin in a fresh process, and a broken plugin cannot pass unnoticed."""
 
 import json
-import os
 import subprocess
 import sys
 import zipfile
@@ -32,11 +31,10 @@ print(json.dumps({
 
 
 def discover(folder: Path) -> dict[str, Any]:
-    """What a fresh process knows after LeRobot's plugin search, with ``folder`` first on its path."""
+    """What a fresh process, started in ``folder``, which is then first on its path, knows after LeRobot's search."""
     result = subprocess.run(
         [sys.executable, "-c", DISCOVER],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder)},
         capture_output=True,
         text=True,
         check=True,
@@ -60,9 +58,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_editable_install_registers_policy_and_environment(tmp_path: Path) -> None:
+def test_editable_install_registers_both_and_a_broken_plugin_is_seen(tmp_path: Path) -> None:
+    info = tmp_path / "lerobot_policy_broken-0.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_policy_broken\nVersion: 0.0\n")
+    (tmp_path / "lerobot_policy_broken.py").write_text("import a_module_that_does_not_exist\n")
     found = discover(tmp_path)
-    assert failures(found) == [], found["log"]
+    assert Path(found["package"]) == ROOT / "lerobot_histmv" / "__init__.py"
+    assert failures(found) == ["ERROR:root:Could not import third-party plugin: lerobot_policy_broken"], found["log"]
     assert "histmv" in found["policies"]
     assert "ur5" in found["envs"]
     assert found["heavy"] == []
@@ -76,14 +79,6 @@ def test_wheel_registers_policy_and_environment(wheel: Path, tmp_path: Path) -> 
     assert failures(found) == [], found["log"]
     assert "histmv" in found["policies"]
     assert "ur5" in found["envs"]
-
-
-def test_a_broken_plugin_is_seen_by_the_same_check(tmp_path: Path) -> None:
-    info = tmp_path / "lerobot_policy_broken-0.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_policy_broken\nVersion: 0.0\n")
-    (tmp_path / "lerobot_policy_broken.py").write_text("import a_module_that_does_not_exist\n")
-    assert failures(discover(tmp_path)) == ["ERROR:root:Could not import third-party plugin: lerobot_policy_broken"]
 
 
 def test_wheel_carries_raw_name_alias_module_configs_and_command(wheel: Path) -> None:
