@@ -17,7 +17,7 @@ from lerobot_histmv.data.instructions import load_paraphrases
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.layers import masked_mean
 from lerobot_histmv.model.network import HistMVNet, Observation
-from lerobot_histmv.model.view_attention import choose_views
+from lerobot_histmv.model.view_attention import choice_loss, choose_views
 from lerobot_histmv.windows import Window, causal_heat, read_window
 
 Batch = dict[str, Any]
@@ -92,6 +92,8 @@ class HistMVPolicy(PreTrainedPolicy):
         weights = losses.term_weights(config.loss)
         per_step = sum(weights[name] * term for name, term in terms.items())
         rows = self._row_weights(batch, window.real)
+        if choice == "sampled":
+            per_step = per_step + choice_loss(encoding.weights, view, per_step)
         log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
         error = (predicted.position - window.action[step, :3]).norm(dim=-1)
         log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
@@ -164,5 +166,5 @@ class HistMVPolicy(PreTrainedPolicy):
             return torch.ones(int(real.sum()), device=real.device)
         age = torch.arange(real.shape[1] - 1, -1, -1, device=real.device)
         left = self.episode_ends[batch["episode_index"]] - batch["index"]
-        windows = (left[:, None] + age).clamp(max=real.shape[1])
+        windows = (left[:, None] + age).clamp(max=self.config.n_obs_steps)
         return 1 / windows[real]

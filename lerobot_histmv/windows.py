@@ -78,10 +78,11 @@ class Window:
 
     def distorted(self, config: augment.AugmentConfig) -> "Window":
         """The window with shifted, recoloured images and noisy depth."""
-        images = torch.cat([augment.jitter_colours(self.rgb, config), rearrange(self.depth, "n k y x -> n k 1 y x")], dim=2)
-        images, intrinsics = augment.shift_pixels(images, self.intrinsics, config.pixels)
-        depth = augment.noisy_depth(images[:, :, 3], config.depth_noise) if config.depth_noise > 0 else images[:, :, 3]
-        return replace(self, rgb=images[:, :, :3], depth=depth, intrinsics=intrinsics)
+        rgb = augment.jitter_colours(self.rgb, config)
+        rgb, depth, intrinsics = augment.shift_pixels(rgb, self.depth, self.intrinsics, config.pixels)
+        if config.depth_noise > 0:
+            depth = augment.noisy_depth(depth, config.depth_noise)
+        return replace(self, rgb=rgb, depth=depth, intrinsics=intrinsics)
 
 
 def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
@@ -95,19 +96,22 @@ def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
     if missing:
         raise ValueError(f"observation lacks {missing}; the policy was made for the cameras {cameras}")
     state = batch[keys.STATE]
-    if state.ndim == 2:
-        real = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
-        pick = lambda values: values  # noqa: E731
-    else:
-        real = ~batch[f"{keys.STATE}_is_pad"] if f"{keys.STATE}_is_pad" in batch else state.new_ones(state.shape[:2]).bool()
-        pick = lambda values: values[real]  # noqa: E731
-    depth = torch.stack([pick(batch[keys.depth_key(camera)]) for camera in cameras], dim=1)
+    windowed = state.ndim == 3
+    real = torch.ones(state.shape[: state.ndim - 1], dtype=torch.bool, device=state.device)
+    if windowed and f"{keys.STATE}_is_pad" in batch:
+        real = ~batch[f"{keys.STATE}_is_pad"]
+
+    def pick(key: str) -> Tensor:
+        return batch[key][real]
+
+    depth = torch.stack([pick(keys.depth_key(camera)) for camera in cameras], dim=1)
     return Window(
-        real=real,
-        rgb=torch.stack([pick(batch[keys.rgb_key(camera)]) for camera in cameras], dim=1),
+        # Columns that are padding in every window would only cost attention.
+        real=real[:, int(real.any(dim=0).int().argmax()) :] if windowed else real[:, None],
+        rgb=torch.stack([pick(keys.rgb_key(camera)) for camera in cameras], dim=1),
         depth=MILLIMETRE * rearrange(depth, "n k 1 y x -> n k y x"),
-        intrinsics=rearrange(pick(batch[keys.INTRINSICS]), "n (k c) -> n k c", c=4),
-        extrinsics=rearrange(pick(batch[keys.EXTRINSICS]), "n (k i j) -> n k i j", i=3, j=4),
-        tool=pick(state)[:, :3],
-        action=pick(batch[keys.ACTION]) if keys.ACTION in batch else None,
+        intrinsics=rearrange(pick(keys.INTRINSICS), "n (k c) -> n k c", c=4),
+        extrinsics=rearrange(pick(keys.EXTRINSICS), "n (k i j) -> n k i j", i=3, j=4),
+        tool=pick(keys.STATE)[:, :3],
+        action=pick(keys.ACTION) if batch.get(keys.ACTION) is not None else None,
     )

@@ -75,28 +75,29 @@ def multiply_quaternions(first: Float[Tensor, "*n 4"], second: Float[Tensor, "*n
 
 
 def shift_pixels(
-    images: Float[Tensor, "n k c y x"], intrinsics: Float[Tensor, "n k 4"], most: int
-) -> tuple[Float[Tensor, "n k c y x"], Float[Tensor, "n k 4"]]:
-    """Shift each image by whole pixels and its principal point with it; uncovered pixels become 0 (invalid depth)."""
-    n, k, _, rows, columns = images.shape
+    rgb: Float[Tensor, "n k 3 y x"], depth: Float[Tensor, "n k y x"], intrinsics: Float[Tensor, "n k 4"], most: int
+) -> tuple[Float[Tensor, "n k 3 y x"], Float[Tensor, "n k y x"], Float[Tensor, "n k 4"]]:
+    """Shift each view by whole pixels and its principal point with it; uncovered pixels become 0 (invalid depth)."""
+    n, k, rows, columns = depth.shape
     steps = torch.randint(-most, most + 1, (n, k, 2))
-    shifted = torch.zeros_like(images)
+    new_rgb, new_depth = torch.zeros_like(rgb), torch.zeros_like(depth)
     for i, j in torch.cartesian_prod(torch.arange(n), torch.arange(k)).tolist():
         dy, dx = steps[i, j].tolist()
         y, x = slice(max(dy, 0), rows + min(dy, 0)), slice(max(dx, 0), columns + min(dx, 0))
-        source_y, source_x = slice(max(-dy, 0), rows - max(dy, 0)), slice(max(-dx, 0), columns - max(dx, 0))
-        shifted[i, j, :, y, x] = images[i, j, :, source_y, source_x]
+        from_y, from_x = slice(max(-dy, 0), rows - max(dy, 0)), slice(max(-dx, 0), columns - max(dx, 0))
+        new_rgb[i, j, :, y, x] = rgb[i, j, :, from_y, from_x]
+        new_depth[i, j, y, x] = depth[i, j, from_y, from_x]
     moved = intrinsics.clone()
     moved[..., 2] += steps[..., 1].to(intrinsics)
     moved[..., 3] += steps[..., 0].to(intrinsics)
-    return shifted, moved
+    return new_rgb, new_depth, moved
 
 
 def jitter_colours(rgb: Float[Tensor, "n k 3 y x"], config: AugmentConfig) -> Float[Tensor, "n k 3 y x"]:
     """Random gain per view and channel and random brightness per view; colours stay in [0, 1]."""
     n, k = rgb.shape[:2]
     gain = 1 + config.contrast * uniform((n, k, 3, 1, 1), rgb)
-    return (rgb * gain + config.brightness * uniform((n, k, 1, 1, 1), rgb)).clamp(0, 1)
+    return (rgb * gain).add_(config.brightness * uniform((n, k, 1, 1, 1), rgb)).clamp_(0, 1)
 
 
 def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tensor, "n k y x"]:

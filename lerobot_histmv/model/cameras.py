@@ -26,14 +26,18 @@ class Workspace(nn.Module):
         """Middle of the box [m]."""
         return (self.low + self.high) / 2
 
-    def contains(self, maps: Float[Tensor, "n k 3 y x"]) -> Bool[Tensor, "n k y x"]:
-        """Which pixels of a map of world coordinates [m] lie inside."""
-        low, high = (rearrange(corner, "c -> c 1 1") for corner in (self.low, self.high))
-        return ((maps >= low) & (maps <= high)).all(dim=2)
-
     def normalise(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """World points [m] as offsets from the centre in units of ``COORDINATE_UNIT``."""
         return (points - self.centre) / COORDINATE_UNIT
+
+    def normalise_map(
+        self, cloud: Float[Tensor, "n k 3 y x"], depth: Float[Tensor, "n k y x"]
+    ) -> tuple[Float[Tensor, "n k 3 y x"], Bool[Tensor, "n k y x"]]:
+        """``normalise`` for maps, and which pixels hold a measurement inside the box; the others become 0."""
+        centre, half = (rearrange(part, "c -> c 1 1") for part in (self.centre, (self.high - self.low) / 2))
+        scaled = (cloud - centre) / COORDINATE_UNIT
+        valid = (scaled.abs() <= half / COORDINATE_UNIT).all(dim=2) & (depth > 0)
+        return scaled * valid[:, :, None], valid
 
 
 def deproject(
@@ -41,14 +45,15 @@ def deproject(
 ) -> Float[Tensor, "n k 3 y x"]:
     """World coordinates [m] of every pixel of depth images [m]; a pixel's centre is (column, row)."""
     y, x = depth_nkyx.shape[-2:]
-    rows = torch.arange(y, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
+    fx, fy, cx, cy = (rearrange(part, "n k -> n k 1") for part in intrinsics_nk4.unbind(-1))
+    right, down, ahead = extrinsics_nk34[..., :3].unbind(-1)
+    # The ray of pixel (u, v) is affine in u and v, so the whole map of rays is two broadcast sums.
+    origin = ahead - right * cx / fx - down * cy / fy
     columns = torch.arange(x, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
-    fx, fy, cx, cy = (rearrange(part, "n k -> n k 1 1") for part in intrinsics_nk4.unbind(-1))
-    right = (columns - cx) / fx * depth_nkyx
-    down = (rows[:, None] - cy) / fy * depth_nkyx
-    in_camera = torch.stack([right, down, depth_nkyx], dim=2)
-    rotated = einsum(extrinsics_nk34[..., :3], in_camera, "n k i j, n k j y x -> n k i y x")
-    return rotated + rearrange(extrinsics_nk34[..., 3], "n k i -> n k i 1 1")
+    rows = torch.arange(y, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
+    across = rearrange(right / fx, "n k c -> n k c 1 1") * columns + rearrange(origin, "n k c -> n k c 1 1")
+    along = rearrange(down / fy, "n k c -> n k c 1 1") * rows[:, None]
+    return torch.addcmul(rearrange(extrinsics_nk34[..., 3], "n k c -> n k c 1 1"), across + along, depth_nkyx[:, :, None])
 
 
 def project(

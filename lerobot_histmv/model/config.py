@@ -23,7 +23,7 @@ class TextureConfig:
 
     backbone: str = "plain"
     widths: tuple[int, ...] = (16, 32, 64, 64)
-    neck: int = 32
+    neck: int = 24
     use_xyz: bool = True
     pretrained: bool = False
 
@@ -69,9 +69,9 @@ class PointsConfig:
         neighbours: points grouped per ball.
     """
 
-    samples: int = 768
-    centres: tuple[int, ...] = (96, 32)
-    radii: tuple[float, ...] = (0.06, 0.15)
+    samples: int = 512
+    centres: tuple[int, ...] = (64, 24)
+    radii: tuple[float, ...] = (0.08, 0.16)
     neighbours: int = 16
 
     def __post_init__(self) -> None:

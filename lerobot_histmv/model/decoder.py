@@ -49,7 +49,7 @@ class PositionDecoder(nn.Module):
         channels = [width, 32, 24, 8]
         skips = skip_channels[::-1]
         self.merge = nn.ModuleList(
-            ConvBlock((channels[i - 1] if i else width) + skip, channels[i]) for i, skip in enumerate(skips)
+            ConvBlock(channels[max(i - 1, 0)] + skip, channels[i], normalise=i < 3) for i, skip in enumerate(skips)
         )
         self.heat = nn.Conv2d(channels[-1], 1, 3, padding=1)
 

@@ -24,7 +24,7 @@ class PlainBackbone(nn.Module):
         super().__init__()
         self.channels = list(widths)
         pairs = zip((channels_in, *widths[:-1]), widths, strict=True)
-        self.stages = nn.ModuleList(ConvBlock(a, b, stride=2) for a, b in pairs)
+        self.stages = nn.ModuleList(ConvBlock(a, b, stride=2, normalise=i > 0) for i, (a, b) in enumerate(pairs))
 
     def forward(self, maps: Float[Tensor, "n c y x"]) -> list[Float[Tensor, "n _ _ _"]]:
         """Maps at strides 2, 4, 8 and 16, fine to coarse."""
@@ -96,8 +96,8 @@ class RgbaFeatures(nn.Module):
         self.neck = PANet(self.backbone.channels[1:], config.neck)
         self.skip_channels = [self.backbone.channels[0], *[config.neck] * 3]
         self.semantic = nn.Linear(semantic_width, config.neck)
-        self.fuse = ConvBlock(2 * config.neck + 1, width)
-        self.refine = ConvBlock(width + config.neck, width)
+        self.fuse = ConvBlock(2 * config.neck + 1, width // 2)
+        self.refine = ConvBlock(width // 2 + config.neck, width)
 
     def forward(
         self,
@@ -109,15 +109,16 @@ class RgbaFeatures(nn.Module):
         """FR of every view and the PANet levels (strides 2, 4, 8, 16) of all n * k images for the decoder's skips.
 
         Args:
-            rgb: colours in [-1, 1].
+            rgb: colours in [0, 1].
             xyz: world coordinates scaled to about [-1, 1], 0 where depth is invalid.
             poses: thermal map of projected tool positions at stride 8.
             semantics: global vector of each view.
         """
         k = rgb.shape[1]
-        images = torch.cat([rgb, xyz], dim=2) if self.use_xyz else rgb
-        flat = rearrange(images, "n k c y x -> (n k) c y x").contiguous(memory_format=torch.channels_last)
-        first, *rest = self.backbone(flat)
+        flat = rearrange(rgb, "n k c y x -> (n k) c y x") * 2 - 1
+        if self.use_xyz:
+            flat = torch.cat([flat, rearrange(xyz, "n k c y x -> (n k) c y x")], dim=1)
+        first, *rest = self.backbone(flat.contiguous(memory_format=torch.channels_last))
         levels = self.neck(rest)
         texture, coarse = levels[1], levels[2]
         expanded = self.semantic(rearrange(semantics, "n k c -> (n k) c"))

@@ -7,12 +7,17 @@ from torch.nn import functional
 
 
 class ConvBlock(nn.Module):
-    """3x3 convolution, group normalisation, leaky ReLU. ``stride=2`` halves the map."""
+    """3x3 convolution, group normalisation, leaky ReLU. ``stride=2`` halves the map.
 
-    def __init__(self, channels_in: int, channels_out: int, stride: int = 1) -> None:
+    ``normalise=False`` is for maps of half the image's size, where the normalisation's memory traffic costs more than the
+    convolution.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, stride: int = 1, normalise: bool = True) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.norm = nn.GroupNorm(4 if channels_out % 4 == 0 else 1, channels_out)
+        self.conv = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=not normalise)
+        groups = 4 if channels_out % 4 == 0 else 1
+        self.norm = nn.GroupNorm(groups, channels_out) if normalise else nn.Identity()
 
     def forward(self, maps: Float[Tensor, "n c y x"]) -> Float[Tensor, "n e y2 x2"]:
         """Maps (n, channels_in, y, x) to (n, channels_out, ceil(y / stride), ceil(x / stride))."""

@@ -102,15 +102,13 @@ class HistMVNet(nn.Module):
         """Everything that depends on one step only: texture, semantics, points, fusion and view weights."""
         size = seen.depth.shape[-2:]
         cloud = deproject(seen.depth, seen.intrinsics, seen.extrinsics)
-        valid = (seen.depth > 0) & self.workspace.contains(cloud)
-        colours = seen.rgb * 2 - 1
-        scaled = self._normalise(cloud) * rearrange(valid, "n k y x -> n k 1 y x")
+        scaled, valid = self.workspace.normalise_map(cloud, seen.depth)
         pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
         cells = (size[0] // POSE_STRIDE, size[1] // POSE_STRIDE)
         poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
 
-        features, skips = self.rgba(colours, scaled, poses, self.semantics.images(seen.rgb))
-        points = self.points(cloud, colours, valid)
+        features, skips = self.rgba(seen.rgb, scaled, poses, self.semantics.images(seen.rgb))
+        points = self.points(cloud, seen.rgb, valid)
         maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
         return Encoding(fuse_views(maps, weights), maps, features, skips, cloud, valid, weights)
@@ -137,9 +135,6 @@ class HistMVNet(nn.Module):
             encoding.cloud.flatten(0, 1)[image],
             encoding.valid.flatten(0, 1)[image],
         )
-
-    def _normalise(self, cloud: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k 3 y x"]:
-        return rearrange(self.workspace.normalise(rearrange(cloud, "n k c y x -> n k y x c")), "n k y x c -> n k c y x")
 
     @staticmethod
     def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:

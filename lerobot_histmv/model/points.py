@@ -87,7 +87,7 @@ class PointEncoder(nn.Module):
     def forward(
         self, xyz: Float[Tensor, "n k 3 y x"], rgb: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]
     ) -> Float[Tensor, "n p d"]:
-        """Point tokens of world coordinates [m] with colours in [-1, 1]; only ``valid`` pixels take part.
+        """Point tokens of world coordinates [m] with colours in [0, 1]; only ``valid`` pixels take part.
 
         In training the points are drawn at random, otherwise always the same way.
         """
@@ -114,4 +114,4 @@ class PointEncoder(nn.Module):
             score = (torch.arange(usable.shape[1], device=xyz.device) * 0.6180339887).frac().expand_as(usable)
         count = min(self.samples, usable.shape[1])
         picks = (score + usable).topk(count, dim=1).indices
-        return gather_points(points, picks), gather_points(colours, picks), usable.gather(1, picks)
+        return gather_points(points, picks), gather_points(colours, picks) * 2 - 1, usable.gather(1, picks)

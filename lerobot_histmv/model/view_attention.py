@@ -110,20 +110,34 @@ def most_informative(weights: Float[Tensor, "n k"]) -> Int[Tensor, " n"]:
 
 
 EXPLORE = 0.1
-"""Share of the expected loss that is spread evenly over the views, so that a view out of favour can win it back."""
+"""Share of training that is spread evenly over the present views, so that a view out of favour can win it back."""
+
+
+def explored(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Mixture of w and the uniform distribution over the present views."""
+    present = (weights > 0).to(weights.dtype)
+    return (1 - EXPLORE) * weights + EXPLORE * present / present.sum(dim=-1, keepdim=True)
 
 
 def choose_views(weights: Float[Tensor, "n k"], choice: str) -> tuple[Int[Tensor, "m 2"], Float[Tensor, " m"]]:
     """Which (step, view) pairs to decode, and the share of its step's loss that each pair gets.
 
-    "argmax": the most informative view. "sampled": one view drawn from w. "expected": every present view, its loss weighted
-    by w, so that w learns which view decodes best.
+    "argmax": the most informative view. "expected": every present view, its loss weighted by w, so that w learns which view
+    decodes best. "sampled": one view drawn from w; with ``choice_loss`` an unbiased estimate of the same at 1/k of the cost.
     """
     n, k = weights.shape
+    steps = torch.arange(n, device=weights.device)
     if choice == "expected":
-        pairs = torch.cartesian_prod(torch.arange(n, device=weights.device), torch.arange(k, device=weights.device))
-        present = weights > 0
-        shares = (1 - EXPLORE) * weights + EXPLORE * present / present.sum(dim=-1, keepdim=True)
-        return pairs, rearrange(shares, "n k -> (n k)")
-    picked = most_informative(weights) if choice == "argmax" else weights.detach().multinomial(1)[:, 0]
-    return torch.stack([torch.arange(n, device=weights.device), picked], dim=-1), weights.new_ones(n)
+        pairs = torch.cartesian_prod(steps, torch.arange(k, device=weights.device))
+        return pairs, rearrange(explored(weights), "n k -> (n k)")
+    picked = most_informative(weights) if choice == "argmax" else explored(weights).detach().multinomial(1)[:, 0]
+    return torch.stack([steps, picked], dim=-1), weights.new_ones(n)
+
+
+def choice_loss(weights: Float[Tensor, "n k"], picked: Int[Tensor, " n"], losses: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Score-function surrogate: its gradient is that of the expected loss over the views' distribution (Williams 1992).
+
+    The batch mean of the losses is the baseline; only the weights receive a gradient.
+    """
+    advantage = (losses - losses.mean()).detach()
+    return advantage * explored(weights).gather(1, picked[:, None])[:, 0].log()
