@@ -1,4 +1,4 @@
-"""Paraphrases of the recorded instructions (``meta/instructions.json``)."""
+"""Paraphrases of a dataset's instructions."""
 
 import json
 from collections.abc import Iterable
@@ -7,21 +7,28 @@ from pathlib import Path
 from lerobot_histmv import keys
 
 
-def load_paraphrases(root: Path | str, recorded: Iterable[str]) -> dict[str, list[str]]:
-    """Recorded instruction -> its paraphrases, itself among them; datasets without the file have no others.
+def load_paraphrases(root: str | Path, recorded: Iterable[str]) -> dict[str, list[str]]:
+    """Recorded instruction -> its paraphrases, itself included, for every one of ``recorded``.
 
-    Args:
-        root: folder of the dataset.
-        recorded: the dataset's task strings.
+    A dataset without ``meta/instructions.json``, or an instruction that it does not name, has no other wording.
 
     Raises:
-        ValueError: the file is not a table of lists of sentences.
+        ValueError: the file is no JSON object of lists of non-empty strings.
     """
     path = Path(root) / keys.INSTRUCTIONS_FILE
-    table = json.loads(path.read_text()) if path.is_file() else {}
-    sound = isinstance(table, dict) and all(
-        isinstance(options, list) and all(isinstance(o, str) for o in options) for options in table.values()
-    )
-    if not sound:
-        raise ValueError(f"{path} must map each recorded instruction to a list of sentences")
-    return {sentence: list(dict.fromkeys([sentence, *table.get(sentence, [])])) for sentence in recorded}
+    stored = _read(path) if path.is_file() else {}
+    return {task: list(dict.fromkeys([task, *stored.get(task, [])])) for task in recorded}
+
+
+def _read(path: Path) -> dict[str, list[str]]:
+    expected = "it must be a JSON object: recorded instruction -> list of paraphrases"
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON ({error}); {expected}") from error
+    if not isinstance(stored, dict):
+        raise ValueError(f"{path} holds a {type(stored).__name__}; {expected}")
+    for instruction, paraphrases in stored.items():
+        if not isinstance(paraphrases, list) or not all(isinstance(text, str) and text for text in paraphrases):
+            raise ValueError(f"{path} gives {instruction!r} the paraphrases {paraphrases!r}; {expected}")
+    return stored

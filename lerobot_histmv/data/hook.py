@@ -1,0 +1,104 @@
+"""Puts the frame reader into the datasets that ``lerobot-train`` makes for the policy ``histmv``.
+
+LeRobot has no setting for the dataset class, so its ``make_train_eval_datasets`` is wrapped. The wrapper also refuses
+settings that would silently break training; it leaves other policies alone.
+"""
+
+import functools
+import inspect
+import logging
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets import LeRobotDataset, factory
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from packaging.specifiers import SpecifierSet
+
+from lerobot_histmv.data import checks, memory
+
+logger = logging.getLogger(__name__)
+
+CHECKED_VERSIONS = SpecifierSet(">=0.6.1,<0.7", prereleases=True)
+"""LeRobot versions whose reader the frame reader is known to equal."""
+FUNCTION = "make_train_eval_datasets"
+HOLDERS = ("lerobot.datasets.factory", "lerobot.scripts.lerobot_train", "__main__")
+"""Modules that may hold the function under its name; the last when the script is run by ``python -m``."""
+
+
+def install(dataset: Any) -> bool:
+    """Let ``dataset``, a ``LeRobotDataset``, read decoded frames from the cache; tells whether it does.
+
+    The samples stay the same bit for bit. With a version of LeRobot that was not checked, or a dataset of another
+    class, nothing changes and a warning says so.
+
+    Raises:
+        ValueError: the dataset is damaged, or holds numbers that no policy can learn from.
+    """
+    if version("lerobot") not in CHECKED_VERSIONS:
+        logger.warning("LeRobot %s is none of %s: its own, slow reader is used", version("lerobot"), CHECKED_VERSIONS)
+        return False
+    if type(dataset) is not LeRobotDataset:
+        logger.warning("%s has no frame reader: LeRobot's own, slow reader is used", type(dataset).__name__)
+        return False
+    from lerobot_histmv.data.reader import FrameReader  # imports LeRobot's internals, which other versions may lack
+
+    assert dataset.hf_dataset is not None  # loads the table if it is not
+    dataset.reader = FrameReader.from_reader(dataset.reader)
+    checks.check_dataset(dataset.meta, dataset.reader.columns.arrays)
+    return True
+
+
+def install_hook() -> None:
+    """Wrap LeRobot's ``make_train_eval_datasets`` wherever it is already known; once, however often it is called."""
+    original = getattr(factory, FUNCTION, None)
+    if original is None or list(inspect.signature(original).parameters) != ["cfg"]:
+        logger.warning("LeRobot %s has no %s(cfg): its own, slow reader is used", version("lerobot"), FUNCTION)
+    elif not hasattr(original, "__wrapped__"):
+        _replace(original, _wrap(original))
+
+
+def remove_hook() -> None:
+    """Undo ``install_hook``."""
+    wrapper = getattr(factory, FUNCTION)
+    if hasattr(wrapper, "__wrapped__"):
+        _replace(wrapper, wrapper.__wrapped__)
+
+
+def _replace(old: Callable, new: Callable) -> None:
+    for name in HOLDERS:
+        module = sys.modules.get(name)
+        if module is not None and vars(module).get(FUNCTION) is old:
+            setattr(module, FUNCTION, new)
+
+
+def _wrap(original: Callable) -> Callable:
+    @functools.wraps(original)
+    def make_train_eval_datasets(cfg: Any) -> Any:
+        if cfg.policy is None or cfg.policy.type != "histmv":
+            return original(cfg)
+        checks.check_training(cfg)
+        memory.keep_freed_memory()
+        made = _make(original, cfg)
+        for dataset in made:
+            if dataset is not None:
+                install(dataset)
+        return made
+
+    return make_train_eval_datasets
+
+
+def _make(original: Callable, cfg: Any) -> Any:
+    """Call ``original``; where it fails because of missing or truncated files, say which."""
+    try:
+        return original(cfg)
+    except Exception as failure:
+        root = Path(cfg.dataset.root or HF_LEROBOT_HOME / cfg.dataset.repo_id)
+        if cfg.dataset.root or root.is_dir():
+            try:
+                checks.check_files(root)
+            except ValueError as reason:
+                raise reason from failure
+        raise

@@ -1,0 +1,110 @@
+"""``lerobot-train`` gets the frame reader, and refusals of what would break RGB-D training, for histmv alone."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import draccus
+import keyframed_dataset as sample
+import pytest
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import factory
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.scripts import lerobot_train
+
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.data import checks, hook
+from lerobot_histmv.data.reader import FrameReader
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sample.make(tmp_path_factory.mktemp("dataset") / "keyframed")
+
+
+@pytest.fixture(autouse=True)
+def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("HISTMV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("lerobot_histmv.data.memory.keep_freed_memory", lambda: True)
+    hook.install_hook()
+    yield
+    hook.remove_hook()
+
+
+def configured(root: Path, *flags: str, policy: Any = None) -> TrainPipelineConfig:
+    args = [f"--dataset.repo_id={sample.REPO}", f"--dataset.root={root}", *flags]
+    config = draccus.parse(TrainPipelineConfig, args=args)
+    config.policy = HistMVConfig(device="cpu") if policy is None else policy
+    return config
+
+
+def test_hook_replaces_the_name_that_the_script_uses_once_and_can_be_undone() -> None:
+    assert lerobot_train.make_train_eval_datasets is factory.make_train_eval_datasets
+    wrapped = factory.make_train_eval_datasets
+    hook.install_hook()
+    assert factory.make_train_eval_datasets is wrapped
+    hook.remove_hook()
+    assert lerobot_train.make_train_eval_datasets is factory.make_train_eval_datasets is wrapped.__wrapped__
+
+
+def test_histmv_gets_the_frame_reader(root: Path) -> None:
+    training, held_out = lerobot_train.make_train_eval_datasets(configured(root))
+    assert isinstance(training.reader, FrameReader)
+    assert held_out is None
+
+
+def test_held_out_episodes_get_it_too(root: Path) -> None:
+    training, held_out = lerobot_train.make_train_eval_datasets(configured(root, "--dataset.eval_split=0.3"))
+    assert isinstance(training.reader, FrameReader)
+    assert isinstance(held_out.reader, FrameReader)
+    assert len(training) + len(held_out) == sum(sample.LENGTHS)
+    for dataset in (training, held_out):
+        assert len(list(dataset)) == len(dataset)
+
+
+def test_other_policies_are_left_alone(root: Path) -> None:
+    flags = ("--dataset.image_transforms.enable=true", "--dataset.depth_output_unit=m")
+    training, _ = lerobot_train.make_train_eval_datasets(configured(root, *flags, policy=ACTConfig(device="cpu")))
+    assert not isinstance(training.reader, FrameReader)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--dataset.image_transforms.enable=true"], r"affine \(RandomAffine\)"),
+        (["--dataset.depth_output_unit=m"], r"depth_output_unit=m: histmv reads depth in mm"),
+        (
+            [
+                "--dataset.streaming=true",
+                "--dataset.image_transforms.enable=true",
+                "--dataset.image_transforms.tfs={hue: {type: ColorJitter, kwargs: {hue: 0.1}}}",
+            ],
+            "streaming also distorts depth",
+        ),
+    ],
+)
+def test_settings_that_break_rgbd_training_are_refused(root: Path, flags: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lerobot_train.make_train_eval_datasets(configured(root, *flags))
+
+
+@pytest.mark.parametrize(
+    "tfs", ["{hue: {type: ColorJitter, kwargs: {hue: 0.1}}}", "{a: {type: RandomAffine, weight: 0}}"]
+)
+def test_colour_transforms_are_allowed(root: Path, tfs: str) -> None:
+    flags = ("--dataset.image_transforms.enable=true", f"--dataset.image_transforms.tfs={tfs}")
+    checks.check_training(configured(root, *flags))
+
+
+def test_damaged_datasets_are_named(root: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(root, tmp_path / "copy"))
+    data = next((copy / "data").rglob("*.parquet"))
+    data.write_bytes(data.read_bytes()[:1009])
+    with pytest.raises(ValueError, match=rf"{data.name} \(1009 bytes\) is truncated"):
+        lerobot_train.make_train_eval_datasets(configured(copy))
+    data.unlink()
+    with pytest.raises(ValueError, match=r"has 0 frames in data/, but meta/info\.json says 11"):
+        lerobot_train.make_train_eval_datasets(configured(copy))
+    with pytest.raises(ValueError, match=r"nowhere is no LeRobot dataset: meta/info\.json is missing"):
+        lerobot_train.make_train_eval_datasets(configured(tmp_path / "nowhere"))
