@@ -1,0 +1,178 @@
+"""``HistMVPolicy.forward``: a finite loss that teaches every weight, counts every row once and falls."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tiny_policy import CAMERAS, TASK, episode, stack, tiny_config, tiny_policy, window
+from tiny_scene import tiny_network
+
+from lerobot_histmv import keys
+from lerobot_histmv.model.augment import AugmentConfig
+from lerobot_histmv.model.config import LossConfig, SemanticsConfig, ViewConfig
+from lerobot_histmv.model.losses import term_weights
+
+
+def training_batch() -> dict[str, Any]:
+    """Windows with 0, 1 and 2 padding rows."""
+    rows = episode(5)
+    return stack([window(rows, end) for end in (4, 1, 0)])
+
+
+@pytest.mark.parametrize("choice", ["expected", "argmax", "sampled"])
+def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) -> None:
+    policy = tiny_policy(tiny_config(network=tiny_network(views=ViewConfig(train_choice=choice)))).train()
+    loss, log = policy(training_batch())
+    loss.backward()
+    assert loss.shape == ()
+    assert loss.isfinite()
+    assert all(math.isfinite(value) for value in log.values())
+    for name, parameter in policy.named_parameters():
+        if parameter.requires_grad:
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all(), name
+    assert sum(p.requires_grad for p in policy.parameters()) == len(policy.get_optim_params())
+
+
+def test_log_names_every_term_view_and_the_error_in_millimetres() -> None:
+    policy = tiny_policy()
+    loss, log = policy(training_batch())
+    weights = term_weights(policy.config.loss)
+    assert set(log) == {*weights, "position_mm", *(f"view_{camera}" for camera in CAMERAS)}
+    assert math.isclose(sum(weights[name] * log[name] for name in weights), loss.item(), rel_tol=1e-5)
+    assert math.isclose(sum(log[f"view_{camera}"] for camera in CAMERAS), 1, rel_tol=1e-5)
+    assert 0 < log["position_mm"] < 2000
+
+
+@pytest.mark.parametrize("form", ["nmi", "text", "literal"])
+@pytest.mark.parametrize("gripper", ["bce", "mse"])
+def test_every_form_of_the_loss_trains(form: str, gripper: str) -> None:
+    network = tiny_network(views=ViewConfig(mi_loss=form))
+    policy = tiny_policy(tiny_config(network=network, loss=LossConfig(gripper=gripper, heatmap=0.0))).train()
+    loss, log = policy(training_batch())
+    loss.backward()
+    assert loss.isfinite()
+    assert "heatmap" not in log
+    assert (log["mutual_information"] <= 0) == (form == "literal")
+
+
+def test_loss_falls_on_a_handful_of_windows() -> None:
+    policy, batch = tiny_policy().train(), window(episode(5), 4)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    losses = []
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss, _ = policy(batch)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert min(losses[-3:]) < 0.6 * losses[0]
+
+
+def test_strong_augmentation_stays_finite_and_evaluation_is_free_of_it() -> None:
+    strong = AugmentConfig(yaw=1.0, shift=0.2, pixels=8, brightness=0.3, contrast=0.3, depth_noise=0.02)
+    policy, batch = tiny_policy(tiny_config(augment=strong)), training_batch()
+    first, second = policy(batch)[0], policy(batch)[0]
+    assert first.equal(second)
+    torch.testing.assert_close(first, tiny_policy()(batch)[0])
+    loss, _ = policy.train()(batch)
+    loss.backward()
+    assert loss.isfinite()
+
+
+def test_batch_given_is_not_changed_by_augmentation() -> None:
+    batch = training_batch()
+    kept = {key: values.clone() for key, values in batch.items() if isinstance(values, torch.Tensor)}
+    tiny_policy(tiny_config(augment=AugmentConfig())).train()(batch)
+    assert all(batch[key].equal(values) for key, values in kept.items())
+
+
+def test_contents_of_padding_do_not_matter() -> None:
+    policy, batch = tiny_policy(), training_batch()
+    expected, _ = policy(batch)
+    for key, values in batch.items():
+        if isinstance(values, torch.Tensor) and values.is_floating_point():
+            values[batch[f"{key}_is_pad"]] = 0.123
+    torch.testing.assert_close(policy(batch)[0], expected)
+
+
+def test_loss_per_window_averages_to_the_loss_when_windows_have_equally_many_rows() -> None:
+    policy, rows = tiny_policy(), episode(5)
+    batch = stack([window(rows, end) for end in (2, 3, 4)])
+    mean, _ = policy(batch)
+    each, _ = policy(batch, reduction="none")
+    assert each.shape == (3,)
+    torch.testing.assert_close(each.mean(), mean)
+    torch.testing.assert_close(each[1], policy(window(rows, 3))[0])
+
+
+def test_episodes_of_one_row_train() -> None:
+    policy = tiny_policy().train()
+    loss, _ = policy(window(episode(1), 0))
+    loss.backward()
+    assert loss.isfinite()
+
+
+def dataset_meta(lengths: list[int], root: Path) -> Any:
+    """The part of LeRobot's metadata that the policy reads."""
+    ends = torch.tensor(lengths).cumsum(dim=0).tolist()
+    return SimpleNamespace(root=root, tasks=SimpleNamespace(index=[TASK]), episodes={"dataset_to_index": ends})
+
+
+@pytest.mark.parametrize("past_steps", [1, 2, 5])
+def test_every_row_of_a_dataset_counts_once(past_steps: int, tmp_path: Path) -> None:
+    """LeRobot draws every row as the end of a window, so a row lies in up to s + 1 windows."""
+    lengths = [1, 2, 3, 7]
+    policy = tiny_policy(tiny_config(past_steps=past_steps), dataset_meta=dataset_meta(lengths, tmp_path))
+    total = torch.zeros(sum(lengths))
+    for number, length in enumerate(lengths):
+        start = sum(lengths[:number])
+        wanted = torch.arange(length)[:, None] + torch.arange(-past_steps, 1)
+        batch = {"index": start + torch.arange(length), "episode_index": torch.full((length,), number)}
+        weights = policy._row_weights(batch, wanted >= 0)
+        total.index_add_(0, start + wanted[wanted >= 0], weights)
+    torch.testing.assert_close(total, torch.ones(sum(lengths)))
+
+
+def test_row_weights_enter_the_loss(tmp_path: Path) -> None:
+    """Over all windows of a short episode, the weighted loss is the plain mean over its rows."""
+    rows = episode(3)
+    batch = stack([window(rows, end) for end in range(3)])
+    batch |= {"index": torch.arange(3), "episode_index": torch.zeros(3, dtype=torch.long)}
+    counted, _ = tiny_policy(dataset_meta=dataset_meta([3], tmp_path))(batch)
+    once, _ = tiny_policy()(window(rows, 2))
+    torch.testing.assert_close(counted, once)
+
+
+def test_training_draws_among_paraphrases_and_evaluation_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = [TASK, "grasp the red cube and raise it", "lift the red cube"]
+    policy = tiny_policy(tiny_config(instructions={TASK: options}))
+    heard: list[str] = []
+    encode = policy.net.semantics.text
+    monkeypatch.setattr(policy.net.semantics, "text", lambda s, device: heard.extend(s) or encode(s, device))
+    policy(training_batch())
+    assert set(heard) == {TASK}
+    for _ in range(7):
+        policy.train()(training_batch())
+    assert set(heard) == set(options)
+
+
+def test_paraphrases_come_from_the_dataset_unless_the_configuration_has_some(tmp_path: Path) -> None:
+    path = tmp_path / keys.INSTRUCTIONS_FILE
+    path.parent.mkdir()
+    path.write_text('{"pick up the red cube": ["lift the red cube"]}')
+    config = tiny_config(instructions={})
+    tiny_policy(config, dataset_meta=dataset_meta([1], tmp_path))
+    assert config.instructions == {TASK: [TASK, "lift the red cube"]}
+
+
+@pytest.mark.xfail(strict=True, reason="the text tower of a trained CLIP is idle beside the sentence encoder")
+def test_no_weight_is_idle_beside_the_sentence_encoder() -> None:
+    pytest.importorskip("transformers", reason="the sentence encoder is optional: transformers is not installed")
+    network = tiny_network(semantics=SemanticsConfig(text="minilm"))
+    policy = tiny_policy(tiny_config(network=network)).train()
+    policy(training_batch())[0].backward()
+    assert [name for name, p in policy.named_parameters() if p.requires_grad and p.grad is None] == []
