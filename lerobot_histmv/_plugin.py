@@ -1,4 +1,4 @@
-"""Registers HistMV with LeRobot: the policy ``histmv``, the environment ``ur5``, their processor steps, the fast reader.
+"""Registers HistMV with LeRobot: policy ``histmv``, environment ``ur5``, their processor steps and the fast reader.
 
 LeRobot imports this (through the module ``lerobot_policy_histmv``) at the start of each of its commands; a failing
 import is only logged there, so nothing here may be optional. Neither mujoco nor CLIP is imported.
