@@ -5,7 +5,7 @@ Nothing is guessed where the names leave a choice: that is an error which lists 
 
 import re
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Set
 
 from dataset_tools.columns import (
     NONE,
@@ -39,12 +39,12 @@ _NOT_A_POSE = {
 _ROTATION = {"quat", "quaternion", "rot", "rotation", "orientation", "ori", "orn", "euler", "axis", "angle", "rotvec"}
 _GRIPPER = {"gripper", "grip", "jaw", "finger", "fingers"}
 _ROTATION_AXES = (
-    ("wxyz", ("qw", "qx", "qy", "qz"), None),
+    ("wxyz", ("qw", "qx", "qy", "qz"), frozenset[str]()),
     ("wxyz", ("w", "x", "y", "z"), _ROTATION),
-    ("rotvec", ("wx", "wy", "wz"), None),
-    ("rpy", ("roll", "pitch", "yaw"), None),
+    ("rotvec", ("wx", "wy", "wz"), frozenset[str]()),
+    ("rpy", ("roll", "pitch", "yaw"), frozenset[str]()),
 )
-"""Rotation format, names of its entries, and the words of which one must stand beside them."""
+"""Rotation format, names of its entries, and the words of which one must stand beside them (if any must)."""
 
 
 def resolve(features: Features, config: ColumnsConfig) -> Columns:
@@ -67,8 +67,8 @@ def resolve(features: Features, config: ColumnsConfig) -> Columns:
 
 
 def _position(features: Features) -> Column:
-    found = _by_axes(features, ("x", "y", "z"), lambda tokens: not tokens & (_NOT_A_POSE | _ROTATION))
-    found += _by_axes(features, ("px", "py", "pz"), lambda tokens: not tokens & _NOT_A_POSE)
+    found = _by_axes(features, ("x", "y", "z"), without=_NOT_A_POSE | _ROTATION)
+    found += _by_axes(features, ("px", "py", "pz"), without=_NOT_A_POSE)
     found = [column for column in found if column.feature != keys.ACTION]
     found += [
         Column(key, (0, 1, 2))
@@ -93,10 +93,8 @@ def _rotation(features: Features, config: ColumnsConfig, near: str) -> tuple[Col
         return None, ""
     if config.rotation:
         return _told_rotation(features, config.rotation, config.rotation_format)
-    for rotation_format, axes, words in _ROTATION_AXES:
-        found = _by_axes(
-            {near: features[near]}, axes, lambda tokens, words=words: words is None or bool(tokens & words)
-        )
+    for rotation_format, axes, beside in _ROTATION_AXES:
+        found = _by_axes({near: features[near]}, axes, beside, without=_NOT_A_POSE)
         if found:
             return _only(found, "rotation"), rotation_format
     return None, ""
@@ -105,13 +103,14 @@ def _rotation(features: Features, config: ColumnsConfig, near: str) -> tuple[Col
 def _told_rotation(features: Features, text: str, rotation_format: str | None) -> tuple[Column, str]:
     column = parse(features, text, "rotation")
     if rotation_format is None:
-        named = _by_axes({column.feature: features[column.feature]}, ("qw", "qx", "qy", "qz"), lambda _: True)
-        if not any(set(candidate.indices) == set(column.indices) for candidate in named):
+        named = _by_axes({column.feature: features[column.feature]}, ("qw", "qx", "qy", "qz"))
+        ordered = next((one for one in named if set(one.indices) == set(column.indices)), None)
+        if ordered is None:
             raise ValueError(
-                f"columns.rotation is {column}; its names do not tell the order, so give --columns.rotation_format="
-                f"{', '.join(ROTATION_FORMATS)}"
+                f"columns.rotation is {column}; its names do not tell the order, so give --columns.rotation_format=... "
+                f"({', '.join(ROTATION_FORMATS)})"
             )
-        column, rotation_format = next(c for c in named if set(c.indices) == set(column.indices)), "wxyz"
+        column, rotation_format = ordered, "wxyz"
     if len(column.indices) != ROTATION_FORMATS[rotation_format]:
         raise ValueError(
             f"columns.rotation is {column}, {len(column.indices)} entries; {rotation_format} has "
@@ -165,8 +164,17 @@ def _is_gripper(name: str) -> bool:
     return bool(tokens & _GRIPPER) and not tokens & (_NOT_A_POSE | _ROTATION | {"x", "y", "z"})
 
 
-def _by_axes(features: Features, axes: tuple[str, ...], fits: Callable[[set[str]], bool]) -> list[Column]:
-    """Sets of entries whose names differ in nothing but the axis, e.g. tcp_x, tcp_y, tcp_z."""
+def _by_axes(
+    features: Features, axes: tuple[str, ...], beside: Set[str] = frozenset(), without: Set[str] = frozenset()
+) -> list[Column]:
+    """Sets of entries whose names differ in nothing but the axis, e.g. tcp_x, tcp_y, tcp_z.
+
+    Args:
+        features: where to look.
+        axes: the words that differ.
+        beside: words of which one must stand in the rest of the name or in the feature's key; empty if none need to.
+        without: words of which none may.
+    """
     found = []
     for key, names in vectors(features).items():
         groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
@@ -175,7 +183,8 @@ def _by_axes(features: Features, axes: tuple[str, ...], fits: Callable[[set[str]
             for axis in set(tokens) & set(axes):
                 groups[tuple("*" if token == axis else token for token in tokens)][axis] = i
         for group, entries in groups.items():
-            if set(entries) == set(axes) and fits(set(group) | _tokens(key)):
+            words = {*group, *_tokens(key)}
+            if set(entries) == set(axes) and not words & without and (not beside or words & beside):
                 indices = tuple(entries[axis] for axis in axes)
                 found.append(Column(key, indices, tuple(names[i] for i in indices)))
     return found

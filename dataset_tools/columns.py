@@ -46,6 +46,8 @@ class ColumnsConfig:
             raise ValueError(
                 f"columns.rotation_format is {self.rotation_format!r}; it must be one of {', '.join(ROTATION_FORMATS)}"
             )
+        if self.rotation_format and not self.rotation:
+            raise ValueError("columns.rotation_format says nothing without columns.rotation; give both")
         ends = self.gripper_range
         if ends is not None and (len(ends) != 2 or ends[0] == ends[1]):
             raise ValueError(f"columns.gripper_range is {ends}; it must be two different numbers: [closed, open]")

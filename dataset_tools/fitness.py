@@ -101,7 +101,9 @@ def _distances(
     """Distances from dot products with the chord (overwritten), squared offsets and the squared chord length."""
     length = np.asarray(length)
     inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > _DEGENERATE)
-    reach = np.clip(along, 0, length) if distance == "segment" else along.copy()
+    reach = along.copy()
+    if distance == "segment":
+        np.minimum(np.maximum(reach, 0, out=reach), length, out=reach)
     along *= 2
     along -= reach
     along *= reach
@@ -137,6 +139,10 @@ class Problem:
         free = np.setdiff1d(np.arange(len(points)), kept)
         return cls(points, kept, distance, cost_table(points, kept.tolist(), distance), free)
 
-    def error(self, selection: Int[np.ndarray, "*g k"]) -> Float[np.ndarray, "*g"]:
-        """Eq. 2: summed error [m] of sorted selections, each including the mandatory nodes."""
-        return self.cost[selection[..., :-1], selection[..., 1:]].sum(-1)
+    def errors(self, selections: Int[np.ndarray, "g k"]) -> Float[np.ndarray, " g"]:
+        """Eq. 2: summed error [m] of each of the sorted selections, which include the mandatory nodes."""
+        return self.cost[selections[:, :-1], selections[:, 1:]].sum(-1)
+
+    def error(self, selection: Int[np.ndarray, " k"]) -> float:
+        """Eq. 2 for one selection."""
+        return float(self.errors(selection[None])[0])

@@ -63,12 +63,12 @@ def evolve(
     genomes = distinct(rng.integers(places, size=(options.population, genes)), places)
     genomes[0], best_error, idle = best, np.inf, 0
     for _ in range(options.generations):
-        errors = problem.error(selections(problem, genomes))
+        errors = problem.errors(selections(problem, genomes))
         leader = int(errors.argmin())
         idle = 0 if errors[leader] < best_error else idle + 1
         if idle == 0:
             best = refine(problem, genomes[leader]) if options.refine else genomes[leader].copy()
-            best_error = float(problem.error(selections(problem, best[None]))[0])
+            best_error = problem.error(selections(problem, best[None])[0])
             genomes[leader], errors[leader] = best, best_error
         if idle >= options.patience:
             break

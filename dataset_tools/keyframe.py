@@ -18,7 +18,7 @@ from dataset_tools.shards import write_json
 from dataset_tools.signals import PauseOptions
 from dataset_tools.simplify import Method
 from dataset_tools.source import open_source
-from dataset_tools.trajectories import gripper_ends, read_vectors, trajectory_of
+from dataset_tools.trajectories import gripper_ends, trajectory_of
 from lerobot_histmv import keys
 
 
@@ -109,7 +109,7 @@ def run(config: KeyframeConfig) -> None:
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
     columns = resolve(source.features, config.columns)
-    vectors = read_vectors(source)
+    vectors = source.all_vectors()
     ends = gripper_ends(columns, vectors)
     trajectories = {
         number: trajectory_of(vectors[number], columns, ends, float(source.meta.fps), number)

@@ -47,10 +47,6 @@ class KeyframeOptions:
     genetic: GeneticOptions = field(default_factory=GeneticOptions)
 
     def __post_init__(self) -> None:
-        if self.method not in simplify.METHODS:
-            raise ValueError(f"method is {self.method!r}; it must be one of {', '.join(simplify.METHODS)}")
-        if self.distance not in ("segment", "line"):
-            raise ValueError(f"distance is {self.distance!r}; it must be segment or line")
         if not self.epsilon > 0:
             raise ValueError(f"epsilon is {self.epsilon}; it must be above 0 metres")
         if not self.rotation_scale >= 0:
@@ -115,7 +111,7 @@ def extract(trajectory: Trajectory, options: KeyframeOptions, episode: int = 0) 
         error_mean=float(away.mean()),
         error_max=float(away.max()),
         optimum_mean=float(best.mean()),
-        gap=_gap(float(problem.error(selection)), float(problem.error(optimum))),
+        gap=_gap(problem.error(selection), problem.error(optimum)),
         seconds=time.perf_counter() - begin,
         warning=_warning(len(mandatory), len(selection), float(away.mean()), options),
     )
@@ -158,7 +154,7 @@ def _choose(problem: Problem, options: KeyframeOptions, episode: int) -> Int[np.
     limit = options.epsilon * len(problem.points)
 
     def good(selection: Int[np.ndarray, " k"]) -> bool:
-        return bool(problem.error(selection) <= limit)
+        return problem.error(selection) <= limit
 
     if options.method == "heuristic":
         return problem.mandatory

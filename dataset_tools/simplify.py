@@ -7,11 +7,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Int
 
-from dataset_tools.fitness import Problem, cost_table, path_deviations
+from dataset_tools.fitness import Problem, cost_table, deviations, path_deviations
 from dataset_tools.genetic import GeneticOptions, evolve
 
 Method = Literal["ga", "exact", "heuristic", "rdp", "awe", "uniform"]
-METHODS: tuple[Method, ...] = ("ga", "exact", "heuristic", "rdp", "awe", "uniform")
 
 Chooser = Callable[[int], Int[np.ndarray, " k"]]
 """Sorted nodes for a wanted number of keyframes (at least the mandatory ones, at most every node)."""
@@ -24,11 +23,16 @@ _NODE_PENALTY = 1e6
 def growing(problem: Problem) -> Iterator[Int[np.ndarray, " k"]]:
     """Ramer-Douglas-Peucker selections, each with one node more: the one farthest from the simplified path."""
     selection = problem.mandatory
+    away = path_deviations(problem.points, selection, problem.distance)
+    away[selection] = -1
     yield selection
     for _ in problem.free:
-        away = path_deviations(problem.points, selection, problem.distance)
-        away[selection] = -1
-        selection = np.sort(np.append(selection, away.argmax()))
+        node = int(away.argmax())
+        place = int(np.searchsorted(selection, node))
+        for start, stop in ((int(selection[place - 1]), node), (node, int(selection[place]))):
+            away[start + 1 : stop] = deviations(problem.points, start, stop, problem.distance)
+        away[node] = -1
+        selection = np.insert(selection, place, node)
         yield selection
 
 
@@ -71,12 +75,12 @@ def fewest(
     choose: Chooser, low: int, high: int, good: Callable[[Int[np.ndarray, " k"]], bool]
 ) -> Int[np.ndarray, " k"]:
     """Selection with the fewest nodes, by bisection over ``low..high``, that is good; that of ``high`` if none is."""
-    best = choose(high)
-    while low < high and good(best):
+    best = None
+    while low < high:
         middle = (low + high) // 2
         candidate = choose(middle)
         if good(candidate):
             best, high = candidate, middle
         else:
             low = middle + 1
-    return best
+    return choose(high) if best is None else best

@@ -61,8 +61,8 @@ class Source:
             raise ValueError(f"episode {episode}: cannot read {', '.join(columns)} from {path}: {error}") from error
         if table.column("frame_index").to_pylist() != list(wanted):
             raise ValueError(
-                f"episode {episode}: {path} holds {len(table)} of {len(wanted)} wanted rows, or not in order; the dataset "
-                "is not whole, so copy it again"
+                f"episode {episode}: {path} holds {len(table)} of {len(wanted)} wanted rows, or not in order; the "
+                "dataset is not whole, so copy it again"
             )
         return table
 
@@ -84,6 +84,20 @@ class Source:
                 raise ValueError(f"episode {episode}, frame {frame}: {name}[{which}] is {array[frame, entry]}")
             arrays[name] = array
         return arrays
+
+    def all_vectors(self) -> dict[int, dict[str, Float[np.ndarray, "n _"]]]:
+        """``vectors`` of every episode.
+
+        Raises:
+            ValueError: also if an episode has a single frame.
+        """
+        for episode in self.episodes:
+            if self.length(episode) < 2:
+                raise ValueError(
+                    f"episode {episode} has 1 frame, but a macro step needs 2: leave it out with "
+                    "--dataset.episodes=[...], or remove it with lerobot-edit-dataset"
+                )
+        return {episode: self.vectors(episode) for episode in self.episodes}
 
     def tasks(self, episode: int, frames: Sequence[int]) -> list[str]:
         """Instruction at each frame."""

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from dataset_tools.columns import Column, Columns
 from dataset_tools.signals import Keyframe, Trajectory
-from dataset_tools.source import Source
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import UNIT_TOLERANCE, canonical
 
@@ -21,21 +20,6 @@ _HYSTERESIS = 0.1
 """The command changes where the opening passes 0.5 by this much."""
 _OUTSIDE = 0.1
 """Share of the gripper's range by which a value may lie outside it."""
-
-
-def read_vectors(source: Source) -> dict[int, Vectors]:
-    """Numeric columns of each episode.
-
-    Raises:
-        ValueError: an entry that is no finite number, an episode of one frame; the message names episode and frame.
-    """
-    for episode in source.episodes:
-        if source.length(episode) < 2:
-            raise ValueError(
-                f"episode {episode} has 1 frame, but a macro step needs 2: leave it out with --dataset.episodes=[...], "
-                "or remove it with lerobot-edit-dataset"
-            )
-    return {episode: source.vectors(episode) for episode in source.episodes}
 
 
 def trajectory_of(vectors: Vectors, columns: Columns, ends: GripperEnds, fps: float, episode: int) -> Trajectory:
