@@ -1,5 +1,6 @@
 """LeRobot's view of the tasks: ``--env.type=ur5 --env.task=pick_and_lift``."""
 
+import multiprocessing
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -105,7 +106,11 @@ class UR5EnvConfig(EnvConfig):
 
 
 def _asynchronous(factories: list[Callable[[], UR5Env]]) -> _LazyAsyncVectorEnv:
-    """One process per environment, started at the first reset."""
+    """One process per environment, started at the first reset.
+
+    Processes come from a server that has done the imports already, else each would spend seconds on them.
+    """
+    multiprocessing.get_context("forkserver").set_forkserver_preload([__name__, "lerobot_histmv.envs.stage"])
     return _LazyAsyncVectorEnv(factories)
 
 
