@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from einops import einsum, rearrange
+from einops import einsum, rearrange, reduce
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -11,6 +11,8 @@ from torch.nn import functional
 from lerobot_histmv.model.layers import ConvBlock, upsample_to
 
 TEMPERATURE = 0.1
+LOCAL_CHANNELS = 24
+"""Channels of the decoded map at stride 4."""
 OFFSET_UNIT = 0.1
 """Length [m] that the second decoder's offset output sees as 1."""
 
@@ -46,7 +48,7 @@ class PositionDecoder(nn.Module):
 
     def __init__(self, width: int, skip_channels: list[int]) -> None:
         super().__init__()
-        channels = [width, 32, 24, 8]
+        channels = [width, 32, LOCAL_CHANNELS, 8]
         skips = skip_channels[::-1]
         self.merge = nn.ModuleList(
             ConvBlock(channels[max(i - 1, 0)] + skip, channels[i], normalise=i < 3) for i, skip in enumerate(skips)
@@ -55,27 +57,44 @@ class PositionDecoder(nn.Module):
 
     def forward(
         self, maps: Float[Tensor, "m d h w"], skips: list[Float[Tensor, "m _ _ _"]], size: tuple[int, int]
-    ) -> Float[Tensor, "m y x"]:
-        """Heat map logits at full resolution; ``skips`` run from fine (stride 2) to coarse (stride 16)."""
+    ) -> tuple[Float[Tensor, "m y x"], Float[Tensor, "m c y4 x4"]]:
+        """Heat map logits at full resolution and the decoded map at stride 4.
+
+        ``skips`` run from fine (stride 2) to coarse (stride 16).
+        """
+        decoded = []
         for merge, skip in zip(self.merge, reversed(skips), strict=True):
             joined = torch.cat([upsample_to(maps, skip), skip], dim=1)
             maps = merge(joined.contiguous(memory_format=torch.channels_last))
+            decoded.append(maps)
         logits = functional.interpolate(self.heat(maps), size=size, mode="bilinear", align_corners=False)
-        return rearrange(logits, "m 1 y x -> m y x")
+        return rearrange(logits, "m 1 y x -> m y x"), decoded[-2]
 
 
 class PoseDecoder(nn.Module):
-    """Two convolutions, pooling and two dense layers: offset, quaternion and gripper, 8 numbers."""
+    """Two convolutions, pooling and two dense layers: offset, quaternion and gripper, 8 numbers.
 
-    def __init__(self, width: int) -> None:
+    Beside the paper's pooled map, the dense layers see the decoded map where the heat map points: the turn of an object
+    and the way from its surface to its centre are local.
+    """
+
+    def __init__(self, width: int, local: int) -> None:
         super().__init__()
         self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
-        self.dense = nn.Sequential(nn.Linear(4 * width, 2 * width), nn.GELU(), nn.Linear(2 * width, 8))
+        self.dense = nn.Sequential(nn.Linear(4 * width + local, 2 * width), nn.GELU(), nn.Linear(2 * width, 8))
 
-    def forward(self, maps: Float[Tensor, "m d h w"], view: Float[Tensor, "m d h w"]) -> Float[Tensor, "m 8"]:
-        """Eight numbers from the history map F_t and the chosen view's RGB-A features FR_t."""
+    def forward(
+        self,
+        maps: Float[Tensor, "m d h w"],
+        view: Float[Tensor, "m d h w"],
+        decoded: Float[Tensor, "m c y4 x4"],
+        heat: Float[Tensor, "m y x"],
+    ) -> Float[Tensor, "m 8"]:
+        """Eight numbers from the history map F_t, the chosen view's features FR_t, the decoded map and the heat map."""
         pooled = functional.adaptive_avg_pool2d(self.convolve(torch.cat([maps, view], dim=1)), 2)
-        return self.dense(rearrange(pooled, "m d i j -> m (d i j)"))
+        share = reduce(heat, "m (y i) (x j) -> m y x", "sum", y=decoded.shape[2], x=decoded.shape[3])
+        local = einsum(share, decoded, "m y x, m c y x -> m c")
+        return self.dense(torch.cat([rearrange(pooled, "m d i j -> m (d i j)"), local], dim=-1))
 
 
 class Decoder(nn.Module):
@@ -84,7 +103,7 @@ class Decoder(nn.Module):
     def __init__(self, width: int, skip_channels: list[int]) -> None:
         super().__init__()
         self.position = PositionDecoder(width, skip_channels)
-        self.pose = PoseDecoder(width)
+        self.pose = PoseDecoder(width, LOCAL_CHANNELS)
 
     def forward(
         self,
@@ -103,9 +122,11 @@ class Decoder(nn.Module):
             cloud: world coordinates of the view's pixels [m].
             valid: pixels with a measurement inside the workspace.
         """
-        log_heat = spatial_log_softmax(self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1])), valid)
-        surface = einsum(log_heat.exp(), cloud, "m y x, m c y x -> m c")
-        numbers = self.pose(maps, view)
+        logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
+        log_heat = spatial_log_softmax(logits, valid)
+        heat = log_heat.exp()
+        surface = einsum(heat, cloud, "m y x, m c y x -> m c")
+        numbers = self.pose(maps, view, decoded, heat.detach())
         return Prediction(
             position=surface + OFFSET_UNIT * numbers[:, :3],
             surface=surface,
