@@ -28,8 +28,8 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
 
     Raises:
         ValueError: the recording would need scene seeds that belong to evaluation.
-        ChildProcessError: a worker process died.
-        RuntimeError: an attempt raised, or most attempts fail.
+        ChildProcessError: a worker process died, or an attempt raised.
+        RuntimeError: most attempts fail.
     """
     context = multiprocessing.get_context("spawn")
     pending: dict[Future[Outcome], int] = {}
@@ -38,7 +38,7 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
             while missing := missing_attempts(outcomes, episodes):
                 _check_sense(setup.seed + missing[-1], outcomes)
                 ready = [attempt for attempt in missing if attempt not in pending.values()]
-                for attempt in ready[: 2 * workers - len(pending)]:
+                for attempt in ready[: workers + 1 - len(pending)]:
                     pending[pool.submit(make_attempt, attempt)] = attempt
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     attempt = pending.pop(future)
@@ -57,7 +57,7 @@ def _result(future: Future[Outcome], seed: int) -> Outcome:
             f"a recording process died (killed, or out of memory? fewer --workers need less); {kept}"
         ) from error
     except Exception as error:
-        raise RuntimeError(f"the attempt with scene seed {seed} broke off ({error}); {kept}") from error
+        raise ChildProcessError(f"the attempt with scene seed {seed} broke off ({error}); {kept}") from error
 
 
 def _check_sense(last_seed: int, outcomes: dict[int, Outcome]) -> None:

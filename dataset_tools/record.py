@@ -67,7 +67,7 @@ def run(config: RecordConfig) -> None:
     """
     settings = checked_settings(config)
     repo_id = config.repo_id or f"local/ur5_{settings.task}"
-    options = {
+    options: dict[str, Any] = {
         "cameras": settings.cameras,
         "image_size": settings.image_size,
         "render_size": settings.image_size,
@@ -75,7 +75,7 @@ def run(config: RecordConfig) -> None:
     }
     check_options(settings.task, **options)
     make_env = partial(make, settings.task, **options)
-    root = Path(config.root).expanduser() if config.root else default_root(repo_id)
+    root = Path(config.root).expanduser().resolve() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
     recorder.record(config.episodes, config.workers)
 
@@ -117,19 +117,29 @@ class Recorder:
 
     def record(self, episodes: int, workers: int) -> None:
         """Record until the dataset holds ``episodes`` successes, unless it already does."""
+        started = time.monotonic()
         finished = self._place.finished(episodes)
-        if finished is None:
-            started = time.monotonic()
-            with self._place.opened() as parts:
-                outcomes = read_outcomes(parts)
-                self._attempt(parts, outcomes, episodes, workers)
-                made = made_attempts(outcomes, episodes)
-                self._place.commit(partial(self._write, parts, made))
-            finished = recording_report(self._settings, made)
-            self._console.print(f"{summary_line(finished)} in {time.monotonic() - started:.0f} s")
+        if finished is not None:
+            self._say(f"already recorded: {summary_line(finished)}")
         else:
-            self._console.print(f"already recorded: {summary_line(finished)}")
-        self._console.print(f"dataset {self._repo_id} in {self._place.root}")
+            made = self._make(episodes, workers)
+            self._say(f"{summary_line(recording_report(self._settings, made))} in {time.monotonic() - started:.0f} s")
+        self._say(f"dataset {self._repo_id} in {self._place.root}")
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True)
+
+    def _make(self, episodes: int, workers: int) -> list[Outcome]:
+        with self._place.opened() as parts:
+            outcomes = read_outcomes(parts)
+            try:
+                self._attempt(parts, outcomes, episodes, workers)
+            except KeyboardInterrupt:
+                self._say("stopped; finished episodes are kept and the same command goes on from there")
+                raise
+            made = made_attempts(outcomes, episodes)
+            self._place.commit(partial(self._write, parts, made))
+        return made
 
     def _attempt(self, parts: Path, outcomes: dict[int, Outcome], episodes: int, workers: int) -> None:
         setup = WorkerSetup(

@@ -68,15 +68,9 @@ class Worker:
             failure=failure,
             rows=len(demonstration.actions),
         )
-        if failure:
-            write_failure(setup.directory, outcome)
-            return outcome
-        columns = demonstration.columns()
-        images = {key: column for key, column in columns.items() if key.startswith(keys.IMAGES_PREFIX)}
-        statistics = {key: image_statistics(column) for key, column in images.items()}
-        as_lists = {key: {name: value.tolist() for name, value in s.items()} for key, s in statistics.items()}
-        outcome = dataclasses.replace(outcome, statistics=as_lists)
-        write_success(setup.directory, outcome, episode_table(columns))
+        if outcome.success:
+            return commit_episode(setup.directory, outcome, demonstration.columns())
+        write_failure(setup.directory, outcome)
         return outcome
 
 
@@ -114,6 +108,16 @@ class Demonstration:
         """All columns, frames stacked along the first axis."""
         columns = {key: np.stack([frame[key] for frame in self.frames]) for key in self.frames[0]}
         return columns | {keys.ACTION: np.stack(self.actions).astype(np.float32)}
+
+
+def commit_episode(directory: Path, outcome: Outcome, columns: Mapping[str, np.ndarray]) -> Outcome:
+    """Encode a successful episode and commit its shard; returns the outcome with the images' statistics."""
+    images = {key: column for key, column in columns.items() if key.startswith(keys.IMAGES_PREFIX)}
+    statistics = {key: image_statistics(column) for key, column in images.items()}
+    as_lists = {key: {name: value.tolist() for name, value in found.items()} for key, found in statistics.items()}
+    outcome = dataclasses.replace(outcome, statistics=as_lists)
+    write_success(directory, outcome, episode_table(columns))
+    return outcome
 
 
 def episode_table(columns: Mapping[str, np.ndarray]) -> pa.Table:

@@ -104,7 +104,7 @@ def test_broken_attempts_are_reported_and_resumed(uninterrupted: Path, tmp_path:
     with pytest.raises(ChildProcessError, match=r"a recording process died .*finished episodes are kept"):
         recording.record(EPISODES, workers=2)
     crash.rename(error)
-    with pytest.raises(RuntimeError, match=r"scene seed [01] broke off \(no graphics\)"):
+    with pytest.raises(ChildProcessError, match=r"scene seed [01] broke off \(no graphics\)"):
         recording.record(EPISODES, workers=1)
     assert not (tmp_path / "data").exists()
     error.unlink()
