@@ -44,17 +44,6 @@ def test_heat_map_of_a_view_that_sees_nothing_is_finite_and_has_finite_gradients
     assert logits.grad.isfinite().all()
 
 
-class Planted(nn.Module):
-    """Stands for the first decoder: the same logits whatever the features."""
-
-    def __init__(self, logits: Tensor) -> None:
-        super().__init__()
-        self.logits = nn.Parameter(logits)
-
-    def forward(self, *_: object) -> Tensor:
-        return self.logits
-
-
 def inputs(seed: int = 1) -> dict[str, object]:
     generator = torch.Generator().manual_seed(seed)
     maps, view = torch.randn(2, M, WIDTH, Y // 16, X // 16, generator=generator)
@@ -81,14 +70,21 @@ def decode(module: Decoder, given: dict[str, object]) -> Prediction:
     return module(**given)  # type: ignore[arg-type]
 
 
-def test_planted_peak_recovers_the_cloud_point_of_its_pixel_exactly() -> None:
+def test_planted_peak_holds_all_heat() -> None:
+    logits, valid = logits_and_mask()
+    for m, (row, column) in enumerate([(3, 5), (17, 29), (31, 47)]):
+        logits[m, row, column], valid[m, row, column] = 100.0, True
+    heat = spatial_log_softmax(logits, valid).exp()
+    peaks = torch.stack([heat[0, 3, 5], heat[1, 17, 29], heat[2, 31, 47]])
+    assert peaks.eq(1).all()
+
+
+def test_only_valid_pixel_is_recovered_exactly() -> None:
     given, module = inputs(), decoder()
     pixels = [(3, 5), (17, 29), (31, 47)]
-    logits = torch.zeros(M, Y, X)
+    given["valid"] = torch.zeros(M, Y, X, dtype=torch.bool)
     for m, (row, column) in enumerate(pixels):
         given["valid"][m, row, column] = True
-        logits[m, row, column] = 100.0
-    module.position = Planted(logits)
     expected = torch.stack([given["cloud"][m, :, row, column] for m, (row, column) in enumerate(pixels)])
     torch.testing.assert_close(decode(module, given).surface, expected, atol=0, rtol=0)
 
@@ -104,20 +100,19 @@ def test_position_is_the_heat_map_s_mean_over_the_cloud_plus_an_offset() -> None
     torch.testing.assert_close(moved.position - moved.surface, found.position - found.surface, atol=1e-5, rtol=0)
 
 
-def test_planted_peak_has_a_gradient_that_moves_the_surface_point() -> None:
-    """Gradient descent on the position through the heat map alone finds a target on the cloud."""
+def test_heat_map_learns_to_point_at_a_target_on_the_cloud() -> None:
     given, module = inputs(), decoder()
-    module.position = Planted(torch.zeros(M, Y, X))
     target = given["cloud"][:, :, 11, 13]
-    optimizer = torch.optim.Adam(module.position.parameters(), lr=0.05)
+    given["valid"][:, 11, 13] = True
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.01)
     errors = []
-    for _ in range(40):
+    for _ in range(30):
         optimizer.zero_grad()
         error = (decode(module, given).surface - target).square().sum()
         error.backward()
         optimizer.step()
         errors.append(error.item())
-    assert errors[-1] < 0.05 * errors[0]
+    assert errors[-1] < 0.2 * errors[0]
 
 
 def test_prediction_has_unit_quaternions_and_the_view_s_size() -> None:
@@ -127,15 +122,14 @@ def test_prediction_has_unit_quaternions_and_the_view_s_size() -> None:
     assert found.gripper.shape == (M,)
 
 
-def test_zero_numbers_give_a_finite_quaternion_and_gradient() -> None:
+def test_weights_of_zero_give_a_finite_quaternion_and_finite_gradients() -> None:
     module = decoder()
-    last = module.pose.dense[-1]
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
+    for parameter in module.parameters():
+        nn.init.zeros_(parameter)
     found = decode(module, inputs())
-    found.quaternion.sum().backward()
+    (found.quaternion.sum() + found.position.sum()).backward()
     assert found.quaternion.isfinite().all()
-    assert last.weight.grad.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in module.parameters() if p.grad is not None)
 
 
 @pytest.mark.parametrize("name", ["maps", "view", "skips"])

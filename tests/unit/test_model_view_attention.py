@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from lerobot_histmv.model.config import ViewConfig
-from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views, most_informative
+from lerobot_histmv.model.view_attention import (
+    EXPLORE,
+    ViewAttention,
+    choice_loss,
+    choose_views,
+    explored,
+    fuse_views,
+    most_informative,
+)
 
 N, K, D, H, W, TEXT = 2, 3, 11, 5, 7, 13
 
@@ -90,12 +98,35 @@ def test_argmax_decodes_the_most_informative_view_of_each_step() -> None:
     assert shares.tolist() == [1, 1]
 
 
-def test_sampling_draws_each_view_as_often_as_its_weight() -> None:
+def test_sampling_draws_each_view_about_as_often_as_its_weight_and_absent_ones_never() -> None:
     torch.manual_seed(0)
-    pairs, shares = choose_views(WEIGHTS[:1].expand(4001, 3), "sampled")
-    frequency = torch.bincount(pairs[:, 1], minlength=3) / len(pairs)
-    torch.testing.assert_close(frequency, WEIGHTS[0], atol=0.03, rtol=0)
-    assert shares.eq(1).all()
+    for weights in WEIGHTS:
+        pairs, shares = choose_views(weights.expand(4001, 3), "sampled")
+        frequency = torch.bincount(pairs[:, 1], minlength=3) / len(pairs)
+        torch.testing.assert_close(frequency, explored(weights[None])[0], atol=0.03, rtol=0)
+        torch.testing.assert_close(frequency, weights, atol=EXPLORE, rtol=0)
+        assert frequency[weights == 0].eq(0).all()
+        assert shares.eq(1).all()
+
+
+def test_score_function_gives_the_gradient_of_the_expected_loss() -> None:
+    """With each view drawn exactly as often as it should be, the estimate has no variance left."""
+    wanted, losses = torch.tensor([0.2, 0.5, 0.3]), torch.tensor([3.0, 1.0, 7.0])
+    logits = ((wanted - EXPLORE / 3) / (1 - EXPLORE)).log().requires_grad_()
+    picked = torch.tensor([0] * 2 + [1] * 5 + [2] * 3)
+    estimate = choice_loss(logits.softmax(dim=0).expand(10, 3), picked, losses[picked]).mean()
+    _, shares = choose_views(logits.softmax(dim=0)[None], "expected")
+    gradients = [torch.autograd.grad(loss, logits)[0] for loss in (estimate, shares @ losses)]
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+def test_score_function_teaches_weights_only() -> None:
+    losses = torch.tensor([3.0, 1.0], requires_grad=True)
+    weights = WEIGHTS.clone().requires_grad_()
+    choice_loss(weights, torch.tensor([0, 2]), losses).sum().backward()
+    assert losses.grad is None
+    assert weights.grad is not None
+    assert weights.grad[0, 0] > 0 > weights.grad[1, 2], "the worse choice becomes less likely"
 
 
 def test_expected_loss_decodes_all_views_and_shares_one_unit_among_the_present() -> None:

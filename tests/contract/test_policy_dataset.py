@@ -1,0 +1,118 @@
+"""From a dataset on disk through LeRobot's own factories, loader and processors into the policy."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from tiny_policy import CAMERAS, STATE_SIZE, TASK, episode
+from tiny_scene import SIZE, tiny_network
+
+from lerobot_histmv import keys
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.modeling_histmv import HistMVPolicy
+
+REPO, LENGTHS, PAST_STEPS = "local/tiny", (1, 3, 5), 2
+
+
+def features() -> dict[str, dict[str, Any]]:
+    """A keyframed dataset's features for two cameras."""
+    state = [*keys.POSE_NAMES, *(f"joint_{i}.pos" for i in range(STATE_SIZE - len(keys.POSE_NAMES)))]
+    named = {
+        keys.STATE: state,
+        keys.ACTION: list(keys.POSE_NAMES),
+        keys.INTRINSICS: keys.intrinsics_names(CAMERAS),
+        keys.EXTRINSICS: keys.extrinsics_names(CAMERAS),
+    }
+    found: dict[str, dict[str, Any]] = {
+        key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in named.items()
+    }
+    axes = ["height", "width", "channels"]
+    for camera in CAMERAS:
+        found[keys.rgb_key(camera)] = {"dtype": "image", "shape": (*SIZE, 3), "names": axes}
+        depth = {"dtype": "image", "shape": (*SIZE, 1), "names": axes, "info": {"is_depth_map": True}}
+        found[keys.depth_key(camera)] = depth
+    return found
+
+
+def frame(rows: dict[str, torch.Tensor], step: int) -> dict[str, Any]:
+    """One row as LeRobot's writer wants it: channels last, depth in whole millimetres."""
+    values = {key: rows[key][step].numpy() for key in features()}
+    for camera in CAMERAS:
+        for key, dtype, factor in ((keys.rgb_key(camera), np.uint8, 255), (keys.depth_key(camera), np.uint16, 1)):
+            values[key] = (factor * values[key]).round().astype(dtype).transpose(1, 2, 0)
+    return values | {"task": TASK}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("datasets") / "tiny"
+    dataset = LeRobotDataset.create(REPO, fps=1, features=features(), root=folder, use_videos=False)
+    for number, length in enumerate(LENGTHS):
+        rows = episode(length, seed=number)
+        for step in range(length):
+            dataset.add_frame(frame(rows, step))
+        dataset.save_episode()
+    dataset.finalize()
+    (folder / keys.INSTRUCTIONS_FILE).write_text(json.dumps({TASK: ["lift the red cube"]}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def policy(root: Path) -> HistMVPolicy:
+    """Made as ``lerobot-train`` makes it: everything that depends on the data is read from the dataset."""
+    torch.manual_seed(0)
+    config = HistMVConfig(device="cpu", push_to_hub=False, network=tiny_network(PAST_STEPS))
+    made = make_policy(config, ds_meta=LeRobotDatasetMetadata(REPO, root=root)).eval()
+    assert isinstance(made, HistMVPolicy)
+    return made
+
+
+@pytest.fixture(scope="module")
+def batch(root: Path, policy: HistMVPolicy) -> dict[str, Any]:
+    """All windows of the dataset in one batch, after the preprocessor."""
+    meta = LeRobotDatasetMetadata(REPO, root=root)
+    dataset = LeRobotDataset(REPO, root=root, delta_timestamps=resolve_delta_timestamps(policy.config, meta))
+    (loaded,) = torch.utils.data.DataLoader(dataset, batch_size=sum(LENGTHS))
+    before, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
+    return before(loaded)
+
+
+def test_policy_reads_cameras_sizes_and_paraphrases_from_the_dataset(policy: HistMVPolicy) -> None:
+    assert policy.config.cameras == CAMERAS
+    assert policy.config.image_size == SIZE
+    assert policy.config.instructions == {TASK: [TASK, "lift the red cube"]}
+
+
+def test_windows_have_the_configured_length_and_every_row_a_target(batch: dict[str, Any]) -> None:
+    assert batch[keys.STATE].shape == (sum(LENGTHS), PAST_STEPS + 1, STATE_SIZE)
+    assert batch[keys.ACTION].shape == (sum(LENGTHS), PAST_STEPS + 1, 8)
+    padded = batch[f"{keys.STATE}_is_pad"]
+    assert padded.equal(batch[f"{keys.ACTION}_is_pad"])
+    assert padded.sum(dim=1).tolist() == [max(0, PAST_STEPS - step) for length in LENGTHS for step in range(length)]
+
+
+def test_every_row_of_the_dataset_counts_once(policy: HistMVPolicy, batch: dict[str, Any]) -> None:
+    real = ~batch[f"{keys.STATE}_is_pad"]
+    rows = (batch["index"][:, None] + torch.arange(-PAST_STEPS, 1))[real]
+    total = torch.zeros(sum(LENGTHS)).index_add(0, rows, policy._row_weights(batch, real))
+    torch.testing.assert_close(total, torch.ones(sum(LENGTHS)))
+
+
+def test_whole_dataset_gives_a_finite_loss(policy: HistMVPolicy, batch: dict[str, Any]) -> None:
+    loss, log = policy(batch)
+    assert loss.isfinite()
+    assert 0 < log["position_mm"] < 2000
+
+
+def test_colours_and_depth_arrive_in_the_policy_s_units(batch: dict[str, Any]) -> None:
+    rows = episode(LENGTHS[-1], seed=len(LENGTHS) - 1)
+    for camera in CAMERAS:
+        rgb, depth = batch[keys.rgb_key(camera)][-1, -1], batch[keys.depth_key(camera)][-1, -1]
+        torch.testing.assert_close(rgb, rows[keys.rgb_key(camera)][-1], atol=1 / 255, rtol=0)
+        torch.testing.assert_close(depth, rows[keys.depth_key(camera)][-1], atol=1e-3, rtol=0)
