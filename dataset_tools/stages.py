@@ -124,8 +124,9 @@ def run_stage(title: str, command: Command, log: Path, console: Console, environ
     if not console.is_terminal:
         say(console, f"{title} ...")
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    display = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     # The child is started before the progress display, whose thread must not be forked.
-    with child_process.start(command, environment) as child, Progress(*columns, console=console, transient=True) as bar:
+    with child_process.start(command, environment) as child, display as bar:
         task = bar.add_task(title, total=None)
         status = child.follow(log, lambda done, total: bar.update(task, completed=done, total=total))
     if status != 0:
