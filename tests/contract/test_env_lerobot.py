@@ -49,7 +49,7 @@ def test_bad_options_are_refused(options: dict[str, object], message: str) -> No
         UR5EnvConfig(**options)
 
 
-@pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
+@pytest.mark.parametrize("asynchronous", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["sync", "async"])
 def test_vector_environments_speak_the_datasets_language(asynchronous: bool) -> None:
     config = UR5EnvConfig(task="reach_target", image_size=SIZE, render_size=SIZE, cameras=["front", "wrist"])
     (vector,) = config.create_envs(2, use_async_envs=asynchronous)["ur5"].values()

@@ -13,19 +13,11 @@ from gymnasium.utils.env_checker import check_env
 
 pytest.importorskip("mujoco")
 
+from tiny_ur5 import AWAY, OUT_OF_REACH, SIZE, expert_actions, tiny
+
 from lerobot_histmv import keys
-from lerobot_histmv.envs import TASKS, UR5Env, make
+from lerobot_histmv.envs import TASKS, UR5Env
 from lerobot_histmv.envs.interface import REACH_HIGH, REACH_LOW
-
-SIZE = 17
-AWAY = np.array([0.3, -0.4, 0.3, 1, 0, 0, 0, 1], np.float32)
-"""An action that reaches nothing."""
-OUT_OF_REACH = np.array([0.75, 0.45, 0.6, 1, 0, 1, 0, 1], np.float32)
-"""A corner of the box, with the gripper pointing back at the robot."""
-
-
-def tiny(task: str, **options: object) -> UR5Env:
-    return make(task, image_size=SIZE, render_size=SIZE, **options)
 
 
 @pytest.fixture(scope="module", params=sorted(TASKS))
@@ -54,12 +46,6 @@ def equal(first: object, second: object) -> bool:
     return bool(np.array_equal(first, second))
 
 
-def expert_actions(env: UR5Env) -> Iterator[np.ndarray]:
-    """The expert's motions as straight macro steps."""
-    for motion in env.expert():
-        yield from motion.actions(env.stage.controller.gripper)
-
-
 def roll_out(env: UR5Env) -> tuple[bool, int]:
     """Follow the expert in macro steps; success and number of steps."""
     for count, action in enumerate(expert_actions(env), start=1):
@@ -80,7 +66,7 @@ def test_gymnasium_finds_nothing_to_complain_about_but_absolute_poses(env: UR5En
     assert [message for message in messages if "symmetric and normalized space" not in message] == []
 
 
-@pytest.mark.parametrize("seed", range(500_000, 500_003))
+@pytest.mark.parametrize("seed", (500_000, 500_001))
 def test_experts_succeed_blended_and_in_macro_steps(env: UR5Env, seed: int) -> None:
     env.reset(seed=seed)
     for motion in env.expert():
@@ -117,7 +103,7 @@ def test_different_seeds_give_different_scenes(env: UR5Env) -> None:
 
 
 def test_objects_lie_apart_in_the_documented_area(env: UR5Env) -> None:
-    for seed in range(20):
+    for seed in range(11):
         env.reset(seed=seed)
         task = env.stage.task
         places = np.array([env.stage.simulation.position(name)[:2] for name in task.slots])
@@ -234,72 +220,6 @@ def test_wild_actions_break_nothing() -> None:
 def test_options_are_checked(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         UR5Env(**options)
-
-
-def test_never_closing_the_gripper_lifts_nothing(lifting: UR5Env) -> None:
-    lifting.reset(seed=500_001)
-    for action in expert_actions(lifting):
-        action[7] = 1
-        _, _, terminated, _, _ = lifting.step(action)
-        assert not terminated
-
-
-def act_until_the_end(env: UR5Env, actions: list[np.ndarray]) -> str:
-    for action in actions:
-        env.step(action)
-    truncated = False
-    while not truncated:
-        _, _, terminated, truncated, info = env.step(AWAY)
-        assert not terminated
-    return str(info["failure"])
-
-
-def above(position: np.ndarray, height: float, gripper: float) -> np.ndarray:
-    return np.array([*position[:2], height, 1, 0, 0, 0, gripper], np.float32)
-
-
-def test_why_lifting_failed(lifting: UR5Env) -> None:
-    lifting.reset(seed=6)
-    target = lifting.stage.simulation.position(lifting.stage.task.targets[0])
-    assert act_until_the_end(lifting, [above(target, 0.2, 0)]) == "grasp missed"
-
-    lifting.reset(seed=6)
-    grasp = [action for _, action in zip(range(2), expert_actions(lifting), strict=False)]
-    assert act_until_the_end(lifting, grasp) == "time"
-
-    lifting.reset(seed=6)
-    task = lifting.stage.task
-    task.slots[:2] = task.slots[1::-1]
-    grasp = [action for _, action in zip(range(2), expert_actions(lifting), strict=False)]
-    task.slots[:2] = task.slots[1::-1]
-    assert act_until_the_end(lifting, grasp) == "wrong object"
-
-
-def test_buttons_in_the_wrong_order_fail() -> None:
-    env = tiny("push_buttons", variation=6)
-    for seed, order in ((1, (1, 0)), (1, (0, 2, 1)), (1, (0, 0, 1))):
-        env.reset(seed=seed)
-        places = [env.stage.simulation.position(name) for name in env.stage.task.slots]
-        for slot in order:
-            for height in (0.14, 0.032, 0.14):
-                _, _, terminated, _, info = env.step(above(places[slot], height, 0))
-                if terminated:
-                    break
-        assert info["is_success"] == (order == (0, 0, 1))
-    env.close()
-
-
-def test_a_pressed_button_looks_as_before() -> None:
-    env = tiny("push_buttons", variation=6)
-    env.reset(seed=1)
-    before, *_ = env.step(AWAY * [1, 1, 1, 1, 1, 1, 1, 0])
-    for motion in env.expert():
-        env.execute(motion)
-        break
-    after, *_ = env.step(AWAY * [1, 1, 1, 1, 1, 1, 1, 0])
-    assert env.stage.task._pressed
-    np.testing.assert_allclose(before["pixels"]["front"], after["pixels"]["front"], atol=1)
-    env.close()
 
 
 def test_servo_control_replays_a_recorded_expert() -> None:
