@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import open_clip
@@ -179,3 +180,12 @@ def test_instructions_survive_with_their_paraphrases(tmp_path: Path) -> None:
     config = PreTrainedConfig.from_pretrained(tmp_path)
     assert isinstance(config, HistMVConfig)
     assert config.instructions == table
+
+
+@pytest.mark.xfail(strict=True, reason="the checkpoint's instructions keep the new dataset's paraphrases out")
+def test_fine_tuning_on_another_dataset_adds_its_instructions(saved: tuple[HistMVPolicy, Path], tmp_path: Path) -> None:
+    _, folder = saved
+    tasks, episodes = SimpleNamespace(index=["press the green button"]), {"dataset_to_index": [1]}
+    other = SimpleNamespace(root=tmp_path, tasks=tasks, episodes=episodes)
+    loaded = HistMVPolicy.from_pretrained(folder, dataset_meta=other)
+    assert {TASK, "press the green button"} <= set(loaded.config.instructions)
