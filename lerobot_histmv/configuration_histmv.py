@@ -15,7 +15,7 @@ WHOLE_RUN = 10_000_000
 
 
 def identity_normalization() -> dict[str, NormalizationMode]:
-    """The policy scales its inputs itself: statistics of near-constant calibration or of quaternions are meaningless."""
+    """The policy scales its inputs itself: statistics of near-constant calibration or quaternions are meaningless."""
     return dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
 
 
@@ -29,7 +29,8 @@ class HistMVConfig(PreTrainedConfig):
         loss: weights and forms of the loss terms.
         augment: strengths of the augmentation.
         cameras: views in the order of the calibration; read from the dataset when empty.
-        instructions: recorded instruction -> its paraphrases; training draws among them. Read from the dataset when empty.
+        instructions: recorded instruction -> its paraphrases, among which training draws; read from the dataset when
+            empty.
         optimizer_lr: peak learning rate.
         optimizer_weight_decay: AdamW's weight decay.
         optimizer_grad_clip_norm: largest norm of the gradient.
@@ -54,7 +55,9 @@ class HistMVConfig(PreTrainedConfig):
         super().__post_init__()
         self.n_obs_steps = self.network.history.past_steps + 1
         if any(mode is not NormalizationMode.IDENTITY for mode in self.normalization_mapping.values()):
-            raise ValueError(f"normalization_mapping={self.normalization_mapping}: histmv scales its inputs itself, use IDENTITY")
+            raise ValueError(
+                f"normalization_mapping={self.normalization_mapping}: histmv scales its inputs itself, use IDENTITY"
+            )
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Read the cameras' order from the dataset and refuse one that the policy would silently misread.
@@ -62,15 +65,20 @@ class HistMVConfig(PreTrainedConfig):
         Raises:
             ValueError: calibration, depth or component names are missing, or differ from those of this configuration.
         """
-        for key, names in ((keys.ACTION, keys.POSE_NAMES), (keys.STATE, keys.POSE_NAMES)):
-            found = list(features.get(key, {}).get("names") or [])
-            if tuple(found[: len(names)]) != names:
-                raise ValueError(f"{key} of the dataset starts with {found[: len(names)]}, but histmv needs {list(names)}")
+        for key in (keys.ACTION, keys.STATE):
+            found = list(features.get(key, {}).get("names") or [])[: len(keys.POSE_NAMES)]
+            if found != list(keys.POSE_NAMES):
+                raise ValueError(f"{key} of the dataset starts with {found}, but histmv needs {list(keys.POSE_NAMES)}")
         missing = [key for key in (keys.INTRINSICS, keys.EXTRINSICS) if key not in features]
         if missing:
-            raise ValueError(f"dataset lacks the camera calibration {missing}; histmv lifts pixels to world points with it")
+            raise ValueError(
+                f"dataset lacks the camera calibration {missing}; histmv lifts pixels to world points with it"
+            )
         cameras = keys.cameras_of(features[keys.INTRINSICS]["names"])
-        for key, names in ((keys.INTRINSICS, keys.intrinsics_names(cameras)), (keys.EXTRINSICS, keys.extrinsics_names(cameras))):
+        for key, names in (
+            (keys.INTRINSICS, keys.intrinsics_names(cameras)),
+            (keys.EXTRINSICS, keys.extrinsics_names(cameras)),
+        ):
             if list(features[key]["names"]) != names:
                 raise ValueError(f"{key} has names {features[key]['names']}, but histmv needs {names}")
         if self.cameras and self.cameras != cameras:
@@ -80,7 +88,9 @@ class HistMVConfig(PreTrainedConfig):
     def validate_features(self) -> None:
         """Raise ValueError unless every calibrated camera has a colour and a depth image of one size."""
         if not self.cameras:
-            raise ValueError("policy.cameras is empty: name the calibrated cameras, or train on a dataset with calibration")
+            raise ValueError(
+                "policy.cameras is empty: name the calibrated cameras, or train on a dataset with calibration"
+            )
         inputs = self.input_features or {}
         wanted = [key(camera) for camera in self.cameras for key in (keys.rgb_key, keys.depth_key)]
         missing = [key for key in (*wanted, keys.STATE, keys.INTRINSICS, keys.EXTRINSICS) if key not in inputs]
@@ -91,7 +101,9 @@ class HistMVConfig(PreTrainedConfig):
             raise ValueError(f"all views must have one size, but the images have sizes {sorted(sizes)}")
         for key, count in ((keys.INTRINSICS, 4), (keys.EXTRINSICS, 12)):
             if inputs[key].shape != (count * len(self.cameras),):
-                raise ValueError(f"{key} has shape {inputs[key].shape}; {len(self.cameras)} cameras need {count} numbers each")
+                raise ValueError(
+                    f"{key} has shape {inputs[key].shape}; {len(self.cameras)} cameras need {count} numbers each"
+                )
         if self.action_feature is None or self.action_feature.shape != (len(keys.POSE_NAMES),):
             raise ValueError(f"action must have the {len(keys.POSE_NAMES)} components {list(keys.POSE_NAMES)}")
 

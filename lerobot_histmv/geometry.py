@@ -67,7 +67,7 @@ def deproject(
 def project(
     points: Float[np.ndarray, "... 3"], intrinsics: Float[np.ndarray, " 4"], world_from_cam: Float[np.ndarray, "3 4"]
 ) -> tuple[Float[np.ndarray, "... 2"], Float[np.ndarray, "..."]]:
-    """Pixel coordinates (u, v) and depth z [m] of world points [m]; z <= 0 lies behind the camera, pixels are then NaN."""
+    """Pixel coordinates (u, v) and depth z [m] of world points [m]; behind the camera z <= 0 and pixels are NaN."""
     fx, fy, cx, cy = intrinsics
     in_camera = (np.asarray(points) - world_from_cam[:, 3]) @ world_from_cam[:, :3]
     x, y, z = np.moveaxis(in_camera, -1, 0)

@@ -19,7 +19,7 @@ POSITION_NAMES = ("ee.x.pos", "ee.y.pos", "ee.z.pos")
 QUATERNION_NAMES = ("ee.qw.pos", "ee.qx.pos", "ee.qy.pos", "ee.qz.pos")
 GRIPPER_NAME = "gripper.pos"
 POSE_NAMES = (*POSITION_NAMES, *QUATERNION_NAMES, GRIPPER_NAME)
-"""Eight numbers of an action, and the first eight of the state: tool position [m], quaternion wxyz, gripper (1 open)."""
+"""Eight numbers of an action, and the first eight of the state: tool position [m], quaternion, gripper (1 open)."""
 
 INTRINSICS_FIELDS = ("fx", "fy", "cx", "cy")
 EXTRINSICS_FIELDS = tuple(f"{kind}{axis}" for axis in "xyz" for kind in ("r0", "r1", "r2", "t"))

@@ -16,8 +16,8 @@ from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data.instructions import load_paraphrases
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.layers import masked_mean
-from lerobot_histmv.model.network import HistMVNet, Observation
-from lerobot_histmv.model.view_attention import choice_loss, choose_views
+from lerobot_histmv.model.network import Encoding, HistMVNet
+from lerobot_histmv.model.view_attention import choice_loss, choose_views, ranking_loss
 from lerobot_histmv.windows import Window, causal_heat, read_window
 
 Batch = dict[str, Any]
@@ -49,8 +49,8 @@ class HistMVPolicy(PreTrainedPolicy):
     def __init__(self, config: HistMVConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        if dataset_meta is not None and not config.instructions:
-            config.instructions = load_paraphrases(dataset_meta.root, dataset_meta.tasks.index)
+        if dataset_meta is not None:  # fine-tuning adds to what the checkpoint knows
+            config.instructions |= load_paraphrases(dataset_meta.root, dataset_meta.tasks.index)
         self.net = HistMVNet(config.network, config.image_size)
         ends = [] if dataset_meta is None else dataset_meta.episodes["dataset_to_index"]
         self.register_buffer("episode_ends", torch.tensor(ends, dtype=torch.long), persistent=False)
@@ -86,16 +86,19 @@ class HistMVPolicy(PreTrainedPolicy):
         encoding, predicted, views, shares = self.net(seen, window.real, choice)
 
         step, view = views.unbind(-1)
-        terms = losses.action_losses(predicted, window.action[step], encoding.cloud[step, view], config.loss)
-        terms = {name: torch.zeros_like(seen.heat[:, 0]).index_add(0, step, shares * term) for name, term in terms.items()}
+        target = window.target
+        terms = losses.action_losses(predicted, target[step], encoding.cloud[step, view], config.loss)
+        per_pair = losses.weighted_sum(terms, config.loss)
+        nothing = torch.zeros_like(seen.heat[:, 0])
+        terms = {name: nothing.index_add(0, step, shares * term) for name, term in terms.items()}
         terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
-        weights = losses.term_weights(config.loss)
-        per_step = sum(weights[name] * term for name, term in terms.items())
+        if choice in ("sampled", "ranked"):
+            terms["choice"] = self._choice_loss(encoding, seen.text, view, per_pair)
+        per_step = losses.weighted_sum(terms, config.loss)
+
         rows = self._row_weights(batch, window.real)
-        if choice == "sampled":
-            per_step = per_step + choice_loss(encoding.weights, view, per_step)
         log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
-        error = (predicted.position - window.action[step, :3]).norm(dim=-1)
+        error = (predicted.position - target[step, :3]).norm(dim=-1)
         log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
         log |= {f"view_{name}": w.item() for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
         if reduction == "none":
@@ -122,7 +125,7 @@ class HistMVPolicy(PreTrainedPolicy):
         real = torch.ones(len(window.tool), len(self._fused), dtype=torch.bool, device=window.tool.device)
         fused = rearrange(torch.stack(list(self._fused), dim=1), "b t d h w -> (b t) d h w")
         enriched = self.net.remember(fused, text.repeat_interleave(len(self._fused), dim=0), real)
-        views, _ = choose_views(encoding.weights, "argmax")
+        views = choose_views(encoding.weights, "argmax")[0]
         predicted = self.net.decode(encoding, enriched[len(self._fused) - 1 :: len(self._fused)], views)
         self.last_decision = Decision(encoding.weights, views[:, 1], predicted.log_heat.exp(), predicted.surface)
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)
@@ -141,6 +144,15 @@ class HistMVPolicy(PreTrainedPolicy):
         if not action.isfinite().all():
             raise ValueError(f"the policy's action is not finite: {action.tolist()}; check the observation for NaN")
         return action
+
+    def _choice_loss(
+        self, encoding: Encoding, text: Float[Tensor, "n c"], view: Int[Tensor, " m"], losses: Float[Tensor, " m"]
+    ) -> Float[Tensor, " n"]:
+        """Teaches the view weights which view decodes best; from detached maps, so as not to bend the features."""
+        weights = self.net.view_attention(encoding.maps.detach(), text.detach(), encoding.weights > 0)
+        if len(losses) == len(weights):
+            return choice_loss(weights, view, losses)
+        return ranking_loss(weights, losses.view_as(weights))
 
     def _augment(self, window: Window) -> Window:
         config = self.config.augment

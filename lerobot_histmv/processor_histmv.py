@@ -46,7 +46,7 @@ class CheckInputStep(ProcessorStep):
         """Check one transition.
 
         Raises:
-            ValueError: a camera is missing, numbers are not finite, a view has no valid depth at all, depth is in metres,
+            ValueError: a camera is missing, numbers are not finite, a view has no valid depth, depth is in metres,
                 or a quaternion is not unit.
         """
         new = transition.copy()
@@ -54,7 +54,9 @@ class CheckInputStep(ProcessorStep):
         for camera in self.cameras:
             for key in (keys.rgb_key(camera), keys.depth_key(camera)):
                 if key not in observation:
-                    raise ValueError(f"observation lacks {key!r}; the policy was trained with the cameras {self.cameras}")
+                    raise ValueError(
+                        f"observation lacks {key!r}; the policy was trained with the cameras {self.cameras}"
+                    )
             key = keys.depth_key(camera)
             observation[key] = observation[key].to(torch.float32)
             check_depth(key, observation[key])
@@ -92,22 +94,30 @@ def check_depth(key: str, depth: Tensor) -> None:
     nearest_to_top = depth.flatten(-3).amax(dim=-1)
     check_finite(key, nearest_to_top)
     if (nearest_to_top <= 0).any():
-        raise ValueError(f"{key} has an image without any valid depth (all 0); leave the camera out or repair the sensor")
+        raise ValueError(
+            f"{key} has an image without any valid depth (all 0); leave the camera out or repair the sensor"
+        )
     if (nearest_to_top < METRE_LIMIT).any():
         largest = float(nearest_to_top.min())
-        raise ValueError(f"{key} reaches at most {largest:.3g}, which looks like metres; histmv expects millimetres (0 = invalid)")
+        raise ValueError(
+            f"{key} reaches at most {largest:.3g}, which looks like metres; histmv expects millimetres (0 = invalid)"
+        )
 
 
 def check_unit(key: str, vectors: Tensor) -> None:
     """Raise ValueError if the quaternions (components 3 to 6) of ``vectors`` are not unit."""
     norms = vectors[..., 3:7].norm(dim=-1)
     if ((norms - 1).abs() > UNIT_TOLERANCE).any():
-        raise ValueError(f"{key} holds a quaternion of norm {float(norms.min()):.3g}; it must be unit, in the order w, x, y, z")
+        raise ValueError(
+            f"{key} holds a quaternion of norm {float(norms.min()):.3g}; it must be unit, in the order w, x, y, z"
+        )
 
 
 def make_histmv_pre_post_processors(
     config: HistMVConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
-) -> tuple[PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]]:
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+]:
     """LeRobot's standard steps around ``CheckInputStep``; normalisation is the identity."""
     features = {**(config.input_features or {}), **(config.output_features or {})}
     before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](

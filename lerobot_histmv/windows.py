@@ -44,8 +44,18 @@ class Window:
     tool: Float[Tensor, "n 3"]
     action: Float[Tensor, "n 8"] | None
 
+    @property
+    def target(self) -> Float[Tensor, "n 8"]:
+        """Actions to learn from; ValueError for a batch of observations alone."""
+        if self.action is None:
+            raise ValueError(f"the batch lacks {keys.ACTION!r}, which training needs")
+        return self.action
+
     def observe(
-        self, text: Float[Tensor, "b c"], tool: Float[Tensor, "n p 3"] | None = None, heat: Float[Tensor, "n p"] | None = None
+        self,
+        text: Float[Tensor, "b c"],
+        tool: Float[Tensor, "n p 3"] | None = None,
+        heat: Float[Tensor, "n p"] | None = None,
     ) -> Observation:
         """What the network sees; past tool positions come from the window itself unless given."""
         if tool is None or heat is None:
@@ -64,16 +74,15 @@ class Window:
 
     def moved(self, motion: Float[Tensor, "b 3 4"], turn: Float[Tensor, "b 4"]) -> "Window":
         """The window after a rigid motion of the world, one per window; ``turn`` is its rotation as a quaternion."""
-        assert self.action is not None
         owner = self.real.nonzero()[:, 0]
         each, turns = motion[owner], turn[owner]
-        points = augment.move_points(each, torch.stack([self.tool, self.action[:, :3]], dim=1))
-        rotated = augment.multiply_quaternions(turns, self.action[:, 3:7])
+        points = augment.move_points(each, torch.stack([self.tool, self.target[:, :3]], dim=1))
+        rotated = augment.multiply_quaternions(turns, self.target[:, 3:7])
         return replace(
             self,
             extrinsics=augment.move_cameras(each, self.extrinsics[:, None])[:, 0],
             tool=points[:, 0],
-            action=torch.cat([points[:, 1], rotated, self.action[:, 7:]], dim=-1),
+            action=torch.cat([points[:, 1], rotated, self.target[:, 7:]], dim=-1),
         )
 
     def distorted(self, config: augment.AugmentConfig) -> "Window":

@@ -45,7 +45,9 @@ def random_world_motion(
     """Random motions of the world, as 3x4 matrices and as the quaternions (w, x, y, z) of their rotations."""
     angle = config.yaw * uniform((count,), centre)
     cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
-    rotation = rearrange(torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1), "b (i j) -> b i j", i=3)
+    rotation = rearrange(
+        torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1), "b (i j) -> b i j", i=3
+    )
     travel = config.shift * uniform((count, 3), centre) * centre.new_tensor([1.0, 1.0, 0.5])
     offset = centre - einsum(rotation, centre, "b i j, j -> b i") + travel
     quaternion = torch.stack([(angle / 2).cos(), zero, zero, (angle / 2).sin()], dim=-1)
@@ -69,7 +71,12 @@ def multiply_quaternions(first: Float[Tensor, "*n 4"], second: Float[Tensor, "*n
     w, x, y, z = first.unbind(-1)
     a, b, c, d = second.unbind(-1)
     return torch.stack(
-        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a],
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
         dim=-1,
     )
 
@@ -103,5 +110,3 @@ def jitter_colours(rgb: Float[Tensor, "n k 3 y x"], config: AugmentConfig) -> Fl
 def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tensor, "n k y x"]:
     """Gaussian noise whose deviation grows with z squared; invalid pixels stay 0."""
     return (depth + strength * depth.square() * torch.randn_like(depth)) * (depth > 0)
-
-

@@ -1,10 +1,9 @@
-"""Pinhole cameras in torch, batched: the same conventions as ``lerobot_histmv.geometry``, which states them in numpy."""
+"""Pinhole cameras in torch, batched; conventions as in ``lerobot_histmv.geometry``, which states them in numpy."""
 
 import torch
 from einops import einsum, rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-
 
 COORDINATE_UNIT = 0.3
 """Length [m] that the network sees as 1."""
@@ -41,7 +40,9 @@ class Workspace(nn.Module):
 
 
 def deproject(
-    depth_nkyx: Float[Tensor, "n k y x"], intrinsics_nk4: Float[Tensor, "n k 4"], extrinsics_nk34: Float[Tensor, "n k 3 4"]
+    depth_nkyx: Float[Tensor, "n k y x"],
+    intrinsics_nk4: Float[Tensor, "n k 4"],
+    extrinsics_nk34: Float[Tensor, "n k 3 4"],
 ) -> Float[Tensor, "n k 3 y x"]:
     """World coordinates [m] of every pixel of depth images [m]; a pixel's centre is (column, row)."""
     y, x = depth_nkyx.shape[-2:]
@@ -53,11 +54,15 @@ def deproject(
     rows = torch.arange(y, device=depth_nkyx.device, dtype=depth_nkyx.dtype)
     across = rearrange(right / fx, "n k c -> n k c 1 1") * columns + rearrange(origin, "n k c -> n k c 1 1")
     along = rearrange(down / fy, "n k c -> n k c 1 1") * rows[:, None]
-    return torch.addcmul(rearrange(extrinsics_nk34[..., 3], "n k c -> n k c 1 1"), across + along, depth_nkyx[:, :, None])
+    return torch.addcmul(
+        rearrange(extrinsics_nk34[..., 3], "n k c -> n k c 1 1"), across + along, depth_nkyx[:, :, None]
+    )
 
 
 def project(
-    points_np3: Float[Tensor, "n p 3"], intrinsics_nk4: Float[Tensor, "n k 4"], extrinsics_nk34: Float[Tensor, "n k 3 4"]
+    points_np3: Float[Tensor, "n p 3"],
+    intrinsics_nk4: Float[Tensor, "n k 4"],
+    extrinsics_nk34: Float[Tensor, "n k 3 4"],
 ) -> tuple[Float[Tensor, "n k p 2"], Float[Tensor, "n k p"]]:
     """Pixel coordinates (column, row) and depth z [m] of world points in every view; z <= 0 is behind the camera."""
     offsets = points_np3[:, None] - extrinsics_nk34[:, :, None, :, 3]

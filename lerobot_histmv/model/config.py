@@ -86,16 +86,17 @@ class ViewConfig:
     Args:
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
         mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
-        train_choice: which views are decoded in training: "argmax", "sampled" from w, or "expected" (all, weighted by w).
+        train_choice: which views are decoded in training: "argmax"; "sampled" from w; "expected" (all, weighted by w);
+            "ranked" (all alike, w learns to rank them by their loss).
     """
 
     mi_loss: str = "nmi"
     mi_dims: int = 8
-    train_choice: str = "expected"
+    train_choice: str = "ranked"
 
     def __post_init__(self) -> None:
         require("views.mi_loss", self.mi_loss, ("nmi", "text", "literal"))
-        require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected"))
+        require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected", "ranked"))
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,6 @@ class HistoryConfig:
         heads: attention heads; divides the network's width.
         dropout: dropout in attention and feed-forward layers.
         skip_first: at the first two steps of an episode only the current observation is used.
-        language: "concat" (sentence vector joined to each patch, mixed by a convolution).
     """
 
     past_steps: int = 5
@@ -126,6 +126,7 @@ class LossConfig:
         action: lambda_1, weight of position + rotation + gripper.
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
+        choice: weight of the term that teaches the view weights which view decodes best.
         gripper: "bce" or "mse" (as printed).
         position_unit: length [m] in which position errors are squared.
     """
@@ -133,6 +134,7 @@ class LossConfig:
     action: float = 1.0
     mutual_information: float = 0.01
     heatmap: float = 0.1
+    choice: float = 0.1
     gripper: str = "bce"
     position_unit: float = 0.1
 

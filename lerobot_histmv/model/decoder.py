@@ -1,4 +1,4 @@
-"""From the history-enriched map and the chosen view's PANet levels to heat map, position, rotation and gripper (paper 3.4)."""
+"""From the history-enriched map and the chosen view's PANet levels to position, rotation and gripper (paper 3.4)."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """RGB-A features: PANet texture, semantic vector and projected tool poses of every view (paper 3.2)."""
 
+from typing import Any
+
 import timm
 import torch
 from einops import rearrange, repeat
@@ -40,16 +42,17 @@ class TimmBackbone(nn.Module):
 
     def __init__(self, name: str, channels_in: int, pretrained: bool) -> None:
         super().__init__()
-        probe = timm.create_model(name, features_only=True, in_chans=channels_in, pretrained=False)
+        probe: Any = timm.create_model(name, features_only=True, in_chans=channels_in, pretrained=False)
         strides = probe.feature_info.reduction()
         missing = {2, 4, 8, 16} - set(strides)
         if missing:
             raise ValueError(f"texture.backbone={name!r} has strides {strides}, but 2, 4, 8 and 16 are needed")
         indices = [strides.index(stride) for stride in (2, 4, 8, 16)]
-        self.body = timm.create_model(
+        body: Any = timm.create_model(
             name, features_only=True, in_chans=channels_in, pretrained=pretrained, out_indices=indices
         )
-        self.channels = self.body.feature_info.channels()
+        self.body = body
+        self.channels: list[int] = body.feature_info.channels()
 
     def forward(self, maps: Float[Tensor, "n c y x"]) -> list[Float[Tensor, "n _ _ _"]]:
         """Maps at strides 2, 4, 8 and 16, fine to coarse."""

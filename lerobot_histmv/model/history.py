@@ -33,8 +33,8 @@ class SelfAttentionBlock(nn.Module):
 def step_mask(real: Bool[Tensor, "b t"], skip_first: bool) -> Bool[Tensor, "b t t"]:
     """Which steps each step may look at: itself and real earlier ones.
 
-    Padding steps see only themselves. With ``skip_first`` the first two real steps see only themselves: "where the current
-    step is less than two, the strategy relies solely on the current observation" (paper 3.1).
+    Padding steps see only themselves. With ``skip_first`` the first two real steps see only themselves: "where the
+    current step is less than two, the strategy relies solely on the current observation" (paper 3.1).
     """
     t = real.shape[1]
     causal = torch.ones(t, t, dtype=torch.bool, device=real.device).tril()
@@ -92,5 +92,7 @@ class History(nn.Module):
         """Join the sentence vector to every patch's channels, mix by a convolution, add the patch codes."""
         b, t, _, h, w = fused.shape
         spoken = torch.cat([fused, repeat(text, "b c -> b t c h w", t=t, h=h, w=w)], dim=2)
-        mixed = fused + rearrange(self.language(rearrange(spoken, "b t c h w -> (b t) c h w")), "(b t) d h w -> b t d h w", b=b)
+        mixed = fused + rearrange(
+            self.language(rearrange(spoken, "b t c h w -> (b t) c h w")), "(b t) d h w -> b t d h w", b=b
+        )
         return mixed + self.patch_code

@@ -9,8 +9,8 @@ from torch.nn import functional
 class ConvBlock(nn.Module):
     """3x3 convolution, group normalisation, leaky ReLU. ``stride=2`` halves the map.
 
-    ``normalise=False`` is for maps of half the image's size, where the normalisation's memory traffic costs more than the
-    convolution.
+    ``normalise=False`` is for maps of half the image's size, where the normalisation's memory traffic costs more than
+    the convolution.
     """
 
     def __init__(self, channels_in: int, channels_out: int, stride: int = 1, normalise: bool = True) -> None:

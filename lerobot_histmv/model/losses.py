@@ -60,5 +60,17 @@ def action_losses(
 
 def term_weights(config: LossConfig) -> dict[str, float]:
     """Weight of every term by name: lambda_1 on the action terms, lambda_2 on mutual information."""
-    weights = dict.fromkeys(("position", "rotation", "gripper"), config.action)
-    return weights | {"heatmap": config.heatmap, "mutual_information": config.mutual_information}
+    return {
+        "position": config.action,
+        "rotation": config.action,
+        "gripper": config.action,
+        "heatmap": config.heatmap,
+        "mutual_information": config.mutual_information,
+        "choice": config.choice,
+    }
+
+
+def weighted_sum(terms: dict[str, Float[Tensor, " m"]], config: LossConfig) -> Float[Tensor, " m"]:
+    """Sum of the named terms times their weights."""
+    weights = term_weights(config)
+    return torch.stack([weights[name] * term for name, term in terms.items()]).sum(dim=0)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from einops import rearrange, reduce
+from einops import reduce
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
@@ -74,7 +74,9 @@ class HistMVNet(nn.Module):
     def __init__(self, config: NetworkConfig, size: tuple[int, int]) -> None:
         super().__init__()
         if any(side % STRIDE for side in size):
-            raise ValueError(f"images of {size[0]} x {size[1]} pixels cannot be halved four times; use multiples of {STRIDE}")
+            raise ValueError(
+                f"images of {size[0]} x {size[1]} pixels cannot be halved four times; use multiples of {STRIDE}"
+            )
         grid = (size[0] // STRIDE, size[1] // STRIDE)
         self.workspace = Workspace(config.workspace)
         self.semantics = Semantics(config.semantics)

@@ -33,7 +33,11 @@ def farthest_points(points: Float[Tensor, "n p 3"], valid: Bool[Tensor, "n p"], 
 
 
 def ball_query(
-    centres: Float[Tensor, "n c 3"], points: Float[Tensor, "n p 3"], valid: Bool[Tensor, "n p"], radius: float, count: int
+    centres: Float[Tensor, "n c 3"],
+    points: Float[Tensor, "n p 3"],
+    valid: Bool[Tensor, "n p"],
+    radius: float,
+    count: int,
 ) -> Int[Tensor, "n c m"]:
     """Indices of the ``count`` nearest valid points within ``radius`` [m]; the nearest fills the missing places."""
     distances = torch.cdist(centres, points).masked_fill(~valid[:, None], torch.inf)

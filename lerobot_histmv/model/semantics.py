@@ -2,6 +2,7 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import open_clip
 import torch
@@ -12,7 +13,7 @@ from torch.nn import functional
 
 from lerobot_histmv.model.config import SemanticsConfig
 
-TINY = {
+TINY: dict[str, Any] = {
     "embed_dim": 64,
     "vision_cfg": {"image_size": 64, "patch_size": 16, "width": 64, "head_width": 16, "layers": 2},
     "text_cfg": {"context_length": 48, "vocab_size": 49408, "width": 64, "heads": 4, "layers": 2},
@@ -34,14 +35,16 @@ def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
             open_clip.load_checkpoint(clip, pretrained)
         return clip
     if model not in open_clip.list_models():
-        raise ValueError(f"semantics.clip_model={model!r} is unknown; choose 'tiny' or one of {open_clip.list_models()}")
+        raise ValueError(
+            f"semantics.clip_model={model!r} is unknown; choose 'tiny' or one of {open_clip.list_models()}"
+        )
     try:
         return open_clip.create_model(model, pretrained=pretrained)
     except (OSError, RuntimeError) as error:
         known = open_clip.list_pretrained_tags_by_model(model)
         raise ValueError(
-            f"cannot load semantics.clip_pretrained={pretrained!r} of {model!r} ({error}). Accepted: a local weights file, "
-            f"or one of the tags {known} when it is in the cache or the Hub is reachable; clip_model='tiny' needs neither"
+            f"cannot load semantics.clip_pretrained={pretrained!r} of {model!r} ({error}). Accepted: a local weights "
+            f"file, or one of the tags {known} if it is cached or the Hub is reachable; clip_model='tiny' needs neither"
         ) from error
 
 
@@ -73,7 +76,9 @@ class ClipTowers(nn.Module):
 
     def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
         """Global vectors of colours in [0, 1], of unit length."""
-        resized = functional.interpolate(rgb, size=self.size, mode="area" if rgb.shape[-1] > self.size[1] else "bicubic")
+        resized = functional.interpolate(
+            rgb, size=self.size, mode="area" if rgb.shape[-1] > self.size[1] else "bicubic"
+        )
         with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
             return self.clip.encode_image((resized - self.mean) / self.std, normalize=True)
 
@@ -116,8 +121,8 @@ class MiniLmText(nn.Module):
 class Semantics(nn.Module):
     """Semantic vectors of views and instructions.
 
-    Towers that are not trained stay outside of the module tree: their weights come from the package, cache or file that the
-    configuration names, and are not written into every checkpoint.
+    Towers that are not trained stay outside of the module tree: their weights come from the package, cache or file that
+    the configuration names, and are not written into every checkpoint.
     """
 
     def __init__(self, config: SemanticsConfig) -> None:

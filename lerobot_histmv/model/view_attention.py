@@ -36,7 +36,9 @@ def gaussian_mutual_information(first: Float[Tensor, "*n s d"], second: Float[Te
     return (information - x.shape[-1] ** 2 / (2 * x.shape[-2])).clamp_min(0)
 
 
-def normalised_mutual_information(maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]) -> Float[Tensor, "n k k"]:
+def normalised_mutual_information(
+    maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]
+) -> Float[Tensor, "n k k"]:
     """NMI = sqrt(1 - exp(-2 I / e)) in [0, 1] between all pairs of views, diagonal 1 (Eq. 5).
 
     For equal correlations of all channel pairs this is the absolute correlation.
@@ -54,11 +56,13 @@ def normalised_mutual_information(maps: Float[Tensor, "n k d h w"], projection: 
     return matrix
 
 
-def mutual_information_loss(weights: Float[Tensor, "n k"], matrix: Float[Tensor, "n k k"], form: str) -> Float[Tensor, " n"]:
+def mutual_information_loss(
+    weights: Float[Tensor, "n k"], matrix: Float[Tensor, "n k k"], form: str
+) -> Float[Tensor, " n"]:
     """View redundancy (Eq. 6) in three forms.
 
-    "nmi": w' M w with unit diagonal, which no single view minimises. "text": the sum over i != j with the plus sign that
-    the text describes. "literal": the same with the printed minus sign, which rewards redundancy.
+    "nmi": w' M w with unit diagonal, which no single view minimises. "text": the sum over i != j with the plus sign
+    that the text describes. "literal": the same with the printed minus sign, which rewards redundancy.
     """
     off_diagonal = matrix * (1 - torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
     if form == "nmi":
@@ -89,7 +93,9 @@ class ViewAttention(nn.Module):
         self, maps: Float[Tensor, "n k d h w"], text: Float[Tensor, "n c"], present: Bool[Tensor, "n k"]
     ) -> Float[Tensor, "n k"]:
         """Softmax weights w over the ``present`` views; absent ones get 0."""
-        pooled = torch.cat([reduce(maps, "n k d h w -> n k d", "mean"), reduce(maps, "n k d h w -> n k d", "max")], dim=-1)
+        pooled = torch.cat(
+            [reduce(maps, "n k d h w -> n k d", "mean"), reduce(maps, "n k d h w -> n k d", "max")], dim=-1
+        )
         scores = self.score(torch.cat([pooled, repeat(text, "n c -> n k c", k=maps.shape[1])], dim=-1))
         return rearrange(scores, "n k 1 -> n k").masked_fill(~present, -math.inf).softmax(dim=-1)
 
@@ -109,35 +115,59 @@ def most_informative(weights: Float[Tensor, "n k"]) -> Int[Tensor, " n"]:
     return weights.argmax(dim=-1)
 
 
-EXPLORE = 0.1
-"""Share of training that is spread evenly over the present views, so that a view out of favour can win it back."""
+EXPLORE = 0.5
+"""Share of training spread evenly over the present views: without it one view wins early and the others starve."""
+
+
+def even_shares(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Uniform distribution over the present views; absent ones have weight 0."""
+    present = (weights > 0).to(weights.dtype)
+    return present / present.sum(dim=-1, keepdim=True)
 
 
 def explored(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """Mixture of w and the uniform distribution over the present views."""
-    present = (weights > 0).to(weights.dtype)
-    return (1 - EXPLORE) * weights + EXPLORE * present / present.sum(dim=-1, keepdim=True)
+    return (1 - EXPLORE) * weights + EXPLORE * even_shares(weights)
 
 
 def choose_views(weights: Float[Tensor, "n k"], choice: str) -> tuple[Int[Tensor, "m 2"], Float[Tensor, " m"]]:
     """Which (step, view) pairs to decode, and the share of its step's loss that each pair gets.
 
-    "argmax": the most informative view. "expected": every present view, its loss weighted by w, so that w learns which view
-    decodes best. "sampled": one view drawn from w; with ``choice_loss`` an unbiased estimate of the same at 1/k of the cost.
+    * "argmax": the most informative view.
+    * "expected": every present view, its loss weighted by w, so that w learns which view decodes best.
+    * "ranked": every present view, all with equal shares; ``ranking_loss`` teaches w.
+    * "sampled": one view drawn from w; ``choice_loss`` teaches w what "expected" does at 1/k of the cost.
     """
     n, k = weights.shape
     steps = torch.arange(n, device=weights.device)
-    if choice == "expected":
+    if choice in ("expected", "ranked"):
         pairs = torch.cartesian_prod(steps, torch.arange(k, device=weights.device))
-        return pairs, rearrange(explored(weights), "n k -> (n k)")
+        return pairs, rearrange(explored(weights) if choice == "expected" else even_shares(weights), "n k -> (n k)")
     picked = most_informative(weights) if choice == "argmax" else explored(weights).detach().multinomial(1)[:, 0]
     return torch.stack([steps, picked], dim=-1), weights.new_ones(n)
 
 
-def choice_loss(weights: Float[Tensor, "n k"], picked: Int[Tensor, " n"], losses: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Score-function surrogate: its gradient is that of the expected loss over the views' distribution (Williams 1992).
+def choice_loss(
+    weights: Float[Tensor, "n k"], picked: Int[Tensor, " n"], losses: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
+    """Score-function surrogate: its gradient points where the loss expected over the views falls (Williams 1992).
 
-    The batch mean of the losses is the baseline; only the weights receive a gradient.
+    The losses are standardised over the batch, which serves as baseline; only the weights receive a gradient.
     """
-    advantage = (losses - losses.mean()).detach()
+    centred = (losses - losses.mean()).detach()
+    advantage = centred / (centred.square().mean().sqrt() + 1e-6)
     return advantage * explored(weights).gather(1, picked[:, None])[:, 0].log()
+
+
+RANKING_TEMPERATURE = 0.3
+"""How many times smaller than the mean loss a difference between views must be to hardly matter."""
+
+
+def ranking_loss(weights: Float[Tensor, "n k"], losses: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
+    """Cross-entropy between w and the views' softmin of their losses; its gradient never vanishes on a wrong choice.
+
+    The temperature follows the step's mean loss, so that late in training small differences still count.
+    """
+    scale = RANKING_TEMPERATURE * losses.mean(dim=-1, keepdim=True) + 1e-6
+    wanted = (-losses / scale).detach().masked_fill(weights <= 0, -math.inf).softmax(dim=-1)
+    return -(wanted * weights.clamp_min(1e-6).log()).sum(dim=-1)
