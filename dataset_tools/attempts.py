@@ -40,7 +40,7 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
                 ready = [attempt for attempt in missing if attempt not in pending.values()]
                 for attempt in ready[: workers + 1 - len(pending)]:
                     pending[pool.submit(make_attempt, attempt)] = attempt
-                for future in wait(pending, return_when=FIRST_COMPLETED).done:
+                for future in sorted(wait(pending, return_when=FIRST_COMPLETED).done, key=pending.__getitem__):
                     attempt = pending.pop(future)
                     outcomes[attempt] = _result(future, setup.seed + attempt)
                     yield outcomes[attempt]

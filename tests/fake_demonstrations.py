@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dataset_tools.record import Recorder
-from dataset_tools.record_place import RecordPlace
-from dataset_tools.record_settings import RecordSettings
+if TYPE_CHECKING:
+    from dataset_tools.record import Recorder
 
 CAMERAS = ("left", "right")
 SIZE = 17
@@ -82,10 +81,12 @@ class FakeEnv:
         return self.seed not in FAILING_SEEDS
 
 
-SETTINGS = RecordSettings("pick_and_lift", None, CAMERAS, SIZE, 20, 0)
-
-
-def recorder(root: Path, **env: Any) -> Recorder:
+def recorder(root: Path, **env: Any) -> "Recorder":
     """Records fake demonstrations into ``root``; ``env`` goes to ``FakeEnv``."""
-    place = RecordPlace(root, SETTINGS, overwrite=False)
-    return Recorder(SETTINGS, partial(FakeEnv, **env), place, "local/fake")
+    from dataset_tools.record import Recorder  # here, because every worker imports this file
+    from dataset_tools.record_place import RecordPlace
+    from dataset_tools.record_settings import RecordSettings
+
+    settings = RecordSettings("pick_and_lift", None, CAMERAS, SIZE, 20, 0)
+    place = RecordPlace(root, settings, overwrite=False)
+    return Recorder(settings, partial(FakeEnv, **env), place, "local/fake")
