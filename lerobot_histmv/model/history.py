@@ -62,7 +62,8 @@ class History(nn.Module):
     def __init__(self, config: HistoryConfig, width: int, text_width: int, grid: tuple[int, int]) -> None:
         super().__init__()
         self.skip_first = config.skip_first
-        self.language = nn.Conv2d(width + text_width, width, 1)
+        self.patch_in, self.patch_out = nn.Conv2d(width, width, 1), nn.Conv2d(width, width, 1)
+        self.gain, self.bias = nn.Linear(text_width, width), nn.Linear(text_width, width)
         self.step_code = nn.Embedding(config.past_steps + 1, width)
         self.patch_code = nn.Parameter(torch.randn(width, *grid) * 0.02)
         nn.init.normal_(self.step_code.weight, std=0.02)
@@ -89,10 +90,13 @@ class History(nn.Module):
         return rearrange(tokens, "b (t h w) d -> b t d h w", t=t, h=h)
 
     def speak(self, fused: Float[Tensor, "b t d h w"], text: Float[Tensor, "b c"]) -> Float[Tensor, "b t d h w"]:
-        """Join the sentence vector to every patch's channels, mix by a convolution, add the patch codes."""
-        b, t, _, h, w = fused.shape
-        spoken = torch.cat([fused, repeat(text, "b c -> b t c h w", t=t, h=h, w=w)], dim=2)
-        mixed = fused + rearrange(
-            self.language(rearrange(spoken, "b t c h w -> (b t) c h w")), "(b t) d h w -> b t d h w", b=b
-        )
-        return mixed + self.patch_code
+        """Mix the sentence vector into every patch and add the patch codes.
+
+        A convolution over a patch's channels joined by the sentence vector is a sum of one over the patch and one over
+        the sentence; the gain beside that sum lets the sentence pick channels, which a sum alone learns slowly.
+        """
+        b = len(fused)
+        text = functional.layer_norm(text, text.shape[-1:])
+        gain, bias = (repeat(part(text), "b d -> (b t) d 1 1", t=fused.shape[1]) for part in (self.gain, self.bias))
+        spoken = functional.gelu(self.patch_in(rearrange(fused, "b t d h w -> (b t) d h w")) * (1 + gain) + bias)
+        return fused + rearrange(self.patch_out(spoken), "(b t) d h w -> b t d h w", b=b) + self.patch_code

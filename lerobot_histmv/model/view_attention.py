@@ -6,6 +6,7 @@ import torch
 from einops import einsum, rearrange, reduce, repeat
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn import functional
 
 from lerobot_histmv.model.config import ViewConfig
 
@@ -96,6 +97,7 @@ class ViewAttention(nn.Module):
         pooled = torch.cat(
             [reduce(maps, "n k d h w -> n k d", "mean"), reduce(maps, "n k d h w -> n k d", "max")], dim=-1
         )
+        text = functional.layer_norm(text, text.shape[-1:])
         scores = self.score(torch.cat([pooled, repeat(text, "n c -> n k c", k=maps.shape[1])], dim=-1))
         return rearrange(scores, "n k 1 -> n k").masked_fill(~present, -math.inf).softmax(dim=-1)
 
