@@ -20,6 +20,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from dataset_tools.assembly import DataFiles
 from dataset_tools.columns import Columns
+from dataset_tools.demonstrations import Demonstrations
 from dataset_tools.frames import CameraFrames, camera_frames
 from dataset_tools.images import image_statistics
 from dataset_tools.keyframes import Keyframing
@@ -62,26 +63,35 @@ def observed(source: Source) -> list[str]:
 
 def write_dataset(
     root: Path,
-    source: Source,
-    columns: Columns,
-    trajectories: Mapping[int, Trajectory],
+    demonstrations: Demonstrations,
     found: Mapping[int, Keyframing],
     repo_id: str,
     on_episode: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Write the rows of all episodes to ``root``, which must not exist.
+    """Write the rows of all episodes in ``found``.
+
+    Args:
+        root: where to; must not exist.
+        demonstrations: the dense data.
+        found: keyframes by episode.
+        repo_id: name of the new dataset.
+        on_episode: called after each.
 
     Returns:
         Warnings about what was written (depth images without a single measurement).
+
+    Raises:
+        ValueError: see ``frames.camera_frames``.
     """
+    source, columns = demonstrations.source, demonstrations.columns
     features = keyframed_features(source, columns)
     meta = LeRobotDatasetMetadata.create(
         repo_id, FPS, features, robot_type=source.meta.robot_type, root=root, use_videos=False
     )
     warnings = []
     with DataFiles(meta) as files:
-        for episode in source.episodes:
-            rows, blank = _rows(source, trajectories[episode], found[episode], episode)
+        for episode, keyframing in found.items():
+            rows, blank = _rows(source, demonstrations.trajectories[episode], keyframing, episode)
             warnings += blank
             tasks = rows.pop("task")
             meta.save_episode_tasks(list(dict.fromkeys(tasks)))
@@ -199,4 +209,4 @@ def default_root(repo_id: str) -> Path:
 
 def push(repo_id: str, root: Path, private: bool) -> None:
     """Upload a dataset to the Hub, with a card and the version tag that LeRobot asks for."""
-    LeRobotDataset(repo_id, root=root).push_to_hub(private=private, tags=["histmv", "keyframes"])
+    LeRobotDataset(repo_id, root=root).push_to_hub(private=private or None, tags=["histmv", "keyframes"])

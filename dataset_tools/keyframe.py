@@ -1,24 +1,26 @@
 """``histmv keyframe``: from a dense LeRobot dataset to one with a row per macro step."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.progress import Progress
 
 from dataset_tools import build
-from dataset_tools.column_guesses import resolve
 from dataset_tools.columns import ColumnsConfig
+from dataset_tools.demonstrations import Demonstrations, read_demonstrations
 from dataset_tools.fitness import Distance
 from dataset_tools.genetic import GeneticOptions
-from dataset_tools.keyframes import MOST, KeyframeOptions, extract
-from dataset_tools.missing import notices
+from dataset_tools.keyframes import MOST, KeyframeOptions, Keyframing, extract
+from dataset_tools.replay import read_scenes, replay
 from dataset_tools.report import Report
 from dataset_tools.shards import write_json
 from dataset_tools.signals import PauseOptions
 from dataset_tools.simplify import Method
 from dataset_tools.source import open_source
-from dataset_tools.trajectories import gripper_ends, trajectory_of
+from dataset_tools.trajectories import labels
 from lerobot_histmv import keys
 
 
@@ -83,6 +85,9 @@ class KeyframeConfig:
     pause: PauseOptions = field(default_factory=PauseOptions)
     # Settings of the genetic algorithm.
     genetic: GeneticOptions = field(default_factory=GeneticOptions)
+    # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
+    # which fail) or drop (leave those out).
+    replay: Literal["off", "flag", "drop"] = "off"
     # Replace an existing output dataset.
     overwrite: bool = False
 
@@ -101,41 +106,51 @@ class KeyframeConfig:
 
 
 def run(config: KeyframeConfig) -> None:
-    """Read, choose, write, report. Nothing appears at the output before all of it is done."""
+    """Read, choose, check, write, report. Nothing appears at the output before all of it is done.
+
+    Raises:
+        ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
+            ``trajectories``, ``frames`` and ``build``.
+    """
     console = Console()
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
     build.check_free(root, config.overwrite)
     source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    columns = resolve(source.features, config.columns)
-    vectors = source.all_vectors()
-    ends = gripper_ends(columns, vectors)
-    trajectories = {
-        number: trajectory_of(vectors[number], columns, ends, float(source.meta.fps), number)
-        for number in source.episodes
-    }
+    demonstrations = read_demonstrations(source, config.columns)
     with build.published(root, config.overwrite) as partial, Progress(console=console) as progress:
         options = config.options()
-        found = {
-            number: extract(trajectory, options, number)
-            for number, trajectory in progress.track(trajectories.items(), description="choosing keyframes")
-        }
+        chosen = progress.track(demonstrations.trajectories.items(), description="choosing keyframes")
+        found = {number: extract(trajectory, options, number) for number, trajectory in chosen}
+        failures = {} if config.replay == "off" else replay_all(demonstrations, found, progress)
+        if config.replay == "drop":
+            found = without_failures(found, failures)
         bar = progress.add_task("writing episodes", total=len(found))
         blank = build.write_dataset(
-            partial, source, columns, trajectories, found, config.output.repo_id, lambda: progress.advance(bar)
+            partial, demonstrations, found, config.output.repo_id, lambda: progress.advance(bar)
         )
-        report = Report(
-            options=options,
-            source=config.dataset.repo_id,
-            columns=columns.chosen(),
-            is_joints=columns.is_joints,
-            episodes=found,
-            notices=[*notices(source, columns, ends), *blank],
-        )
+        notices = [*demonstrations.notices(), *blank]
+        report = Report(options, config.dataset.repo_id, demonstrations.columns, found, failures, notices)
         write_json(partial / keys.KEYFRAMING_FILE, report.as_json())
         (partial / keys.KEYFRAMING_FILE).with_suffix(".md").write_text(report.markdown(), encoding="utf-8")
     report.show(console)
     console.print(f"written to {root}", highlight=False)
     if config.output.push_to_hub:
         build.push(config.output.repo_id, root, config.output.private)
+
+
+def replay_all(demonstrations: Demonstrations, found: Mapping[int, Keyframing], progress: Progress) -> dict[int, str]:
+    """By episode, why executing its key poses failed; empty for a success."""
+    source, trajectories = demonstrations.source, demonstrations.trajectories
+    scenes = read_scenes(source.root, source.meta.total_episodes)
+    actions = {number: labels(trajectories[number], one.keyframes[1:]) for number, one in found.items()}
+    return dict(progress.track(replay(scenes, actions), total=len(actions), description="replaying"))
+
+
+def without_failures(found: Mapping[int, Keyframing], failures: Mapping[int, str]) -> dict[int, Keyframing]:
+    """The episodes whose key poses succeeded; ValueError if there is none."""
+    kept = {number: one for number, one in found.items() if not failures[number]}
+    if not kept:
+        raise ValueError(f"no episode's key poses succeed ({failures}); a smaller --epsilon keeps more of them")
+    return kept

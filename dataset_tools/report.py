@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lerobot_histmv
+from dataset_tools.columns import Columns
 from dataset_tools.keyframes import KeyframeOptions, Keyframing
 from lerobot_histmv import keys
 
@@ -30,23 +31,23 @@ class Report:
     Attributes:
         options: how keyframes were chosen.
         source: repo id of the dense dataset.
-        columns: columns used, as text.
-        is_joints: the curve is joint angles [rad] instead of a tool position [m].
+        columns: columns used.
         episodes: keyframes by episode number of the source.
+        failures: by episode, why executing its key poses failed, empty for a success; no entries without a replay.
         notices: what is missing in the dataset, was dropped or assumed.
     """
 
     options: KeyframeOptions
     source: str
-    columns: Mapping[str, str]
-    is_joints: bool
+    columns: Columns
     episodes: Mapping[int, Keyframing]
+    failures: Mapping[int, str]
     notices: Sequence[str]
 
     @property
     def unit(self) -> str:
         """Unit of errors."""
-        return "rad" if self.is_joints else "m"
+        return "rad" if self.columns.is_joints else "m"
 
     def reasons(self) -> dict[str, int]:
         """How many keyframes were kept for each reason."""
@@ -72,6 +73,8 @@ class Report:
             "episodes_in_median_gap": len(gaps),
             "seconds_per_episode": float(np.mean([one.seconds for one in found])),
             "warnings": sum(bool(one.warning) for one in found),
+            "replayed": len(self.failures),
+            "replay_failures": sum(map(bool, self.failures.values())),
         }
 
     def as_json(self) -> dict[str, Any]:
@@ -81,7 +84,7 @@ class Report:
             "options": asdict(self.options),
             "unit": self.unit,
             "source": self.source,
-            "columns": dict(self.columns),
+            "columns": self.columns.chosen(),
             "notices": list(self.notices),
             "versions": {
                 "histmv": lerobot_histmv.__version__,
@@ -90,6 +93,7 @@ class Report:
                 "python": platform.python_version(),
             },
             "totals": self.totals(),
+            "replay": {str(number): failure for number, failure in self.failures.items()},
             "episodes": [{"source_episode": number, **asdict(one)} for number, one in self.episodes.items()],
         }
 
@@ -133,9 +137,13 @@ class Report:
             )
             + f" whose optimum is above {1000 * GAP_COUNTS_ABOVE:g} {unit} per frame",
             f"time: {total['seconds_per_episode']:.3f} s per episode",
-            "columns: " + ", ".join(f"{name} = {column}" for name, column in self.columns.items()),
+            "columns: " + ", ".join(f"{name} = {column}" for name, column in self.columns.chosen().items()),
         ]
+        if self.failures:
+            successes = total["replayed"] - total["replay_failures"]
+            lines.append(f"replay: the key poses succeed in {successes} of {total['replayed']} episodes")
         warnings = [f"episode {number}: {one.warning}" for number, one in self.episodes.items() if one.warning]
+        warnings += [f"episode {number}: replay failed: {why}" for number, why in self.failures.items() if why]
         return [*lines, *(f"note: {notice}" for notice in self.notices), *(f"warning: {line}" for line in warnings)]
 
     def markdown(self) -> str:

@@ -21,6 +21,7 @@ from helpers.episodes import (
     write_vector_picks,
 )
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from dataset_tools import cli
 from dataset_tools.images import encode_depth
@@ -129,6 +130,17 @@ def test_the_same_seed_gives_the_same_data(tmp_path: Path) -> None:
     dense = write_vector_picks(tmp_path / "dense")
     files = [keyframe(dense, tmp_path / name) / "data/chunk-000/file-000.parquet" for name in ("first", "second")]
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_without_roots_the_datasets_lie_where_lerobot_keeps_them_and_may_be_uploaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    uploaded: list[tuple[str, Path]] = []
+    monkeypatch.setattr(LeRobotDataset, "push_to_hub", lambda self, **_: uploaded.append((self.repo_id, self.root)))
+    write_vector_picks(HF_LEROBOT_HOME / "test/home")
+    cli.main(["keyframe", "--dataset.repo_id=test/home", "--output.repo_id=test/away", "--output.push_to_hub=true"])
+    assert (HF_LEROBOT_HOME / "test/away" / keys.KEYFRAMING_FILE).is_file()
+    assert uploaded == [("test/away", (HF_LEROBOT_HOME / "test/away").resolve())]
 
 
 def test_what_is_printed_tells_why_frames_were_kept_and_what_is_missing(

@@ -1,0 +1,85 @@
+"""The episodes to keyframe, read and understood: which columns mean what, and what the dataset lacks."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from dataset_tools.column_guesses import resolve
+from dataset_tools.columns import Columns, ColumnsConfig
+from dataset_tools.signals import Trajectory
+from dataset_tools.source import Source
+from dataset_tools.trajectories import GripperEnds, gripper_ends, trajectory_of
+from lerobot_histmv import keys
+
+_REPLACED = {keys.ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index"}
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstrations:
+    """Episodes of a dataset.
+
+    Attributes:
+        source: the dataset.
+        columns: which of its columns are used.
+        ends: gripper values that count as closed and open.
+        trajectories: tool motion by episode.
+    """
+
+    source: Source
+    columns: Columns
+    ends: GripperEnds
+    trajectories: Mapping[int, Trajectory]
+
+    def notices(self) -> list[str]:
+        """Sentences about what is missing, assumed or dropped."""
+        return [*self._missing(), *self._assumed(), *self._dropped()]
+
+    def _missing(self) -> list[str]:
+        features, columns = self.source.features, self.columns
+        needed = {
+            "depth images (declared with is_depth_map)": bool(self.source.depth_keys),
+            keys.INTRINSICS: keys.INTRINSICS in features,
+            keys.EXTRINSICS: keys.EXTRINSICS in features,
+            "a tool position": not columns.is_joints,
+            "a tool rotation": columns.rotation is not None,
+            "a gripper": columns.gripper is not None,
+        }
+        absent = [name for name, present in needed.items() if not present]
+        if not absent:
+            return []
+        return [f"keyframed, but the histmv policy cannot train on it: it lacks {', '.join(absent)}"]
+
+    def _assumed(self) -> list[str]:
+        columns, (closed, opened) = self.columns, self.ends
+        found = []
+        if columns.is_joints:
+            found.append("the curve is joint angles: errors and epsilon count radians, and the action is joint angles")
+        if columns.gripper and columns.gripper.feature != keys.ACTION:
+            found.append(f"no gripper in the action: its command is read from {columns.gripper}, which may lag behind")
+        if columns.gripper and columns.gripper_range is None:
+            found.append(
+                f"the gripper counts as closed at {closed:g} and open at {opened:g}, the ends of its range in the "
+                "data; if that is the wrong way round, give --columns.gripper_range=[closed,open]"
+            )
+        return found
+
+    def _dropped(self) -> list[str]:
+        source = self.source
+        dropped = [key for key in source.features if key not in _REPLACED and not key.startswith(keys.OBS_PREFIX)]
+        found = [f"not kept: {', '.join(dropped)}"] if dropped else []
+        if not (source.root / keys.INSTRUCTIONS_FILE).is_file():
+            found.append(f"no {keys.INSTRUCTIONS_FILE}: each task's text is its only instruction")
+        return found
+
+
+def read_demonstrations(source: Source, config: ColumnsConfig) -> Demonstrations:
+    """Episodes of ``source``, with columns as configured or guessed.
+
+    Raises:
+        ValueError: see ``column_guesses.resolve``, ``Source.vectors`` and ``trajectories``.
+    """
+    columns = resolve(source.features, config)
+    vectors = source.all_vectors()
+    ends = gripper_ends(columns, vectors)
+    fps = float(source.meta.fps)
+    trajectories = {number: trajectory_of(arrays, columns, ends, fps, number) for number, arrays in vectors.items()}
+    return Demonstrations(source, columns, ends, trajectories)
