@@ -21,8 +21,8 @@ LOSS = re.compile(r"\bstep:\S+ .*?\bloss:([-+.\deE]+|nan|inf)")
 CHECKPOINT = re.compile(r"Checkpoint policy after step (\d+)")
 START = "Start offline training"
 
-DEPTH_SHOWN = (300.0, 1500.0)
-"""Range of the depth pictures [mm]."""
+DEPTH_SHOWN = (2.0, 98.0)
+"""Percentiles of a camera's depth that its pictures span."""
 
 
 @dataclass(frozen=True)
@@ -129,26 +129,33 @@ def scalar(value: Any) -> Any:
     return value[0] if isinstance(value, list) else value
 
 
+def depth_range(keyframes: list[Keyframe], camera: str) -> tuple[float, float]:
+    """Depth [mm] that the first and last colour of ``camera``'s depth pictures stand for; invalid depth is left out."""
+    depths = [depth for frame in keyframes if (depth := frame.pictures[camera][1]) is not None]
+    valid = np.concatenate([depth[depth > 0] for depth in depths])
+    low, high = np.percentile(valid, DEPTH_SHOWN) if len(valid) else (0.0, 1.0)
+    return float(low), float(high)
+
+
 def draw_contact_sheet(keyframes: list[Keyframe], path: Path) -> None:
     """Write one episode as a picture: a row per macro step, colours and depth of each camera side by side."""
     panels = [
-        [(f"{camera}{' depth' if is_depth else ''}", pixels) for camera, pair in frame.pictures.items()
-         for is_depth, pixels in enumerate(pair) if pixels is not None]
-        for frame in keyframes
-    ]  # fmt: skip
-    rows, columns = len(panels), len(panels[0])
+        (camera, kind)
+        for camera, pair in keyframes[0].pictures.items()
+        for kind, pixels in enumerate(pair)
+        if pixels is not None
+    ]
+    rows, columns = len(keyframes), len(panels)
     figure = Figure(figsize=(1.5 * columns + 0.9, 1.5 * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
-    for frame, line, axes_of_row in zip(keyframes, panels, grid, strict=True):
-        for (name, pixels), axes in zip(line, axes_of_row, strict=True):
-            if pixels.ndim == 3:
-                axes.imshow(pixels)
-            else:
-                axes.imshow(np.ma.masked_equal(pixels, 0), cmap="viridis", vmin=DEPTH_SHOWN[0], vmax=DEPTH_SHOWN[1])
-            axes.set_xticks([])
-            axes.set_yticks([])
-            if frame is keyframes[0]:
-                axes.set_title(name, fontsize=9)
-        axes_of_row[0].set_ylabel(f"{frame.reason}\n{frame.seconds:.2f} s", fontsize=9)
+    for (camera, is_depth), axes_of_column in zip(panels, grid.T, strict=True):
+        axes_of_column[0].set_title(f"{camera} depth" if is_depth else camera, fontsize=9)
+        low, high = depth_range(keyframes, camera) if is_depth else (None, None)
+        for frame, axes in zip(keyframes, axes_of_column, strict=True):
+            pixels = frame.pictures[camera][is_depth]
+            axes.imshow(np.ma.masked_equal(pixels, 0) if is_depth else pixels, vmin=low, vmax=high)
+            axes.set(xticks=[], yticks=[])
+    for frame, axes in zip(keyframes, grid[:, 0], strict=True):
+        axes.set_ylabel(f"{frame.reason}\n{frame.seconds:.2f} s", fontsize=9)
     figure.suptitle(f"“{keyframes[0].instruction}”", fontsize=11)
     figure.savefig(path, dpi=110)

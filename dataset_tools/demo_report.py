@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dataset_tools.demo import EVALUATION, KEYFRAMES, PAGE
 from dataset_tools.demo_figures import draw_contact_sheet, draw_losses, read_keyframes, read_losses
+from dataset_tools.eval_results import Episode, read_episodes
 from dataset_tools.stages import LOG_FOLDER, duration, read_state
 
 MOST_VIDEOS = 12
@@ -20,8 +21,9 @@ TEMPLATE = """<!doctype html>
   h1 {{ margin-bottom: 0; }} h2 {{ margin-top: 2.5rem; }}
   .success {{ font-size: 1.6rem; }}
   img {{ max-width: 100%; }}
-  .videos {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(13rem, 1fr)); gap: 1rem; }}
+  .videos {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(17rem, 1fr)); gap: 1rem; }}
   video {{ width: 100%; background: #eee; }} figure {{ margin: 0; }} figcaption {{ font-size: .85rem; color: #555; }}
+  td:nth-child(2) {{ white-space: nowrap; }}
   td, th {{ padding: .15rem 1.5rem .15rem 0; text-align: left; vertical-align: top; }} code {{ font-size: .8rem; }}
 </style>
 <h1>HistMV demo</h1>
@@ -56,15 +58,23 @@ def success_line(folder: Path) -> str:
 
 
 def video_tags(folder: Path) -> str:
-    """The evaluation's first videos, as paths relative to the page."""
-    paths = sorted((folder / EVALUATION).rglob("*.mp4"), key=lambda path: (len(path.name), path))
-    if not paths:
+    """The evaluation's first videos, each with what was asked and what came of it."""
+    filmed = [episode for episode in read_episodes(folder / EVALUATION / "episodes.jsonl") if episode.video]
+    if not filmed:
         return "<p>The evaluation wrote no videos.</p>"
-    return "".join(
-        f'<figure><video controls muted loop preload="metadata" src="{html.escape(str(path.relative_to(folder)))}">'
-        f"</video><figcaption>{html.escape(path.stem.replace('_', ' '))}</figcaption></figure>"
-        for path in paths[:MOST_VIDEOS]
+    figure = (
+        '<figure><video controls muted loop preload="metadata" src="{}"></video><figcaption>{}</figcaption></figure>'
     )
+    return "".join(
+        figure.format(html.escape(f"{EVALUATION}/{episode.video}"), html.escape(caption(episode)))
+        for episode in filmed[:MOST_VIDEOS]
+    )
+
+
+def caption(episode: Episode) -> str:
+    """One line about an evaluated episode."""
+    outcome = "success" if episode.success else f"failed: {episode.failure}"
+    return f"“{episode.instruction}”: {outcome} (scene {episode.seed})"
 
 
 def stage_rows(folder: Path) -> str:

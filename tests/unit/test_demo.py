@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from dataset_tools import demo, demo_figures, demo_report
+from dataset_tools.eval_results import Episode, EpisodeLog
 from dataset_tools.stages import Record, write_state
 from lerobot_histmv import keys
 
@@ -110,7 +111,12 @@ def finished_demo(tmp_path: Path) -> Path:
     overall = {"n_successes": 6, "n_episodes": 7, "pc_success": 100 * 6 / 7, "wilson_95": [48.7, 97.4]}
     (tmp_path / demo.EVALUATION / "videos").mkdir(parents=True)
     (tmp_path / demo.EVALUATION / "eval_info.json").write_text(json.dumps({"overall": overall}))
-    (tmp_path / demo.EVALUATION / "videos" / "seed_200003.mp4").touch()
+    log = EpisodeLog(tmp_path / demo.EVALUATION / "episodes.jsonl")
+    measured = {"steps": 3, "sum_reward": 0.0, "max_reward": 0.0, "decision_ms": 17.0, "seconds": 1.0}
+    asked = {"task": "pick_and_lift", "instruction": "lift <red>"}
+    log.append(Episode(seed=200003, success=False, failure="ik", video="videos/200003.mp4", **asked, **measured))
+    log.append(Episode(seed=200004, success=True, failure="", video="videos/200004.mp4", **asked, **measured))
+    log.append(Episode(seed=200005, success=True, failure="", video="", **asked, **measured))
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "train.log").write_text("\n".join(training_log("start", "400 4.0", "800 3.0")))
     write_state(tmp_path, {"train": Record(["lerobot-train", "--steps=800"], True, 83.0)})
@@ -134,7 +140,10 @@ def test_page_shows_success_videos_pictures_and_commands(finished_demo: Path) ->
     demo_report.run(demo_report.ReportConfig(folder=finished_demo))
     page = (finished_demo / demo.PAGE).read_text()
     assert "6 of 7 unseen scenes succeeded: 86 % (95 % interval 49 to 97 %)." in page
-    assert 'src="evaluation/videos/seed_200003.mp4"' in page
+    assert page.count("<video") == 2
+    assert 'src="evaluation/videos/200003.mp4"' in page
+    assert "“lift &lt;red&gt;”: failed: ik (scene 200003)" in page
+    assert "“lift &lt;red&gt;”: success (scene 200004)" in page
     assert "1 min 23 s" in page
     assert "lerobot-train --steps=800" in page
     for name in ("keyframes.png", "loss.png"):
