@@ -21,7 +21,7 @@ LOSS = re.compile(r"\bstep:\S+ .*?\bloss:([-+.\deE]+|nan|inf)")
 CHECKPOINT = re.compile(r"Checkpoint policy after step (\d+)")
 START = "Start offline training"
 
-DEPTH_SHOWN = (2.0, 98.0)
+DEPTH_SHOWN = (2.0, 85.0)
 """Percentiles of a camera's depth that its pictures span."""
 
 
