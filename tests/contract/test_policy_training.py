@@ -22,7 +22,7 @@ def training_batch() -> dict[str, Any]:
     return stack([window(rows, end) for end in (4, 1, 0)])
 
 
-@pytest.mark.parametrize("choice", ["expected", "argmax", "sampled"])
+@pytest.mark.parametrize("choice", ["ranked", "expected", "argmax", "sampled"])
 def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) -> None:
     policy = tiny_policy(tiny_config(network=tiny_network(views=ViewConfig(train_choice=choice)))).train()
     loss, log = policy(training_batch())
@@ -37,10 +37,13 @@ def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) ->
     assert sum(p.requires_grad for p in policy.parameters()) == len(policy.get_optim_params())
 
 
-def test_log_names_every_term_view_and_the_error_in_millimetres() -> None:
-    policy = tiny_policy()
+@pytest.mark.parametrize("training", [True, False])
+def test_log_names_every_term_view_and_the_error_in_millimetres(training: bool) -> None:
+    policy = tiny_policy().train(training)
     loss, log = policy(training_batch())
     weights = term_weights(policy.config.loss)
+    if not training:
+        del weights["choice"]
     assert set(log) == {*weights, "position_mm", *(f"view_{camera}" for camera in CAMERAS)}
     assert math.isclose(sum(weights[name] * log[name] for name in weights), loss.item(), rel_tol=1e-5)
     assert math.isclose(sum(log[f"view_{camera}"] for camera in CAMERAS), 1, rel_tol=1e-5)

@@ -7,7 +7,7 @@ import torch
 
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
-from lerobot_histmv.model.losses import action_losses, heat_loss, quaternion_loss, term_weights
+from lerobot_histmv.model.losses import action_losses, heat_loss, quaternion_loss, term_weights, weighted_sum
 
 M, Y, X = 3, 5, 7
 
@@ -90,9 +90,16 @@ def test_gripper_loss_in_both_forms(form: str) -> None:
 
 @pytest.mark.parametrize("heatmap", [0.0, 0.5])
 def test_every_term_has_a_weight_of_its_name(heatmap: float) -> None:
-    config = LossConfig(action=3.0, mutual_information=0.2, heatmap=heatmap)
+    config = LossConfig(action=3.0, mutual_information=0.2, heatmap=heatmap, choice=0.7)
     terms, weights = action_losses(*prediction(), config), term_weights(config)
-    assert {*terms, "mutual_information"} <= set(weights)
+    assert {*terms, "mutual_information", "choice"} == {*weights} - ({"heatmap"} if heatmap == 0 else set())
     assert ("heatmap" in terms) == (heatmap > 0)
     assert [weights[name] for name in ("position", "rotation", "gripper")] == [3.0] * 3
-    assert (weights["mutual_information"], weights["heatmap"]) == (0.2, heatmap)
+    assert (weights["mutual_information"], weights["heatmap"], weights["choice"]) == (0.2, heatmap, 0.7)
+
+
+def test_loss_is_the_weighted_sum_of_its_terms() -> None:
+    config = LossConfig(action=3.0, mutual_information=0.2, heatmap=0.5)
+    terms = action_losses(*prediction(), config) | {"mutual_information": torch.arange(M) + 1.0}
+    weights = term_weights(config)
+    torch.testing.assert_close(weighted_sum(terms, config), sum(weights[name] * term for name, term in terms.items()))
