@@ -92,8 +92,8 @@ def test_damaged_line_is_named(tmp_path: Path) -> None:
 
 
 def test_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
-    lines = ("import sys, fcntl", "f = open(sys.argv[1], 'w')", "fcntl.flock(f, fcntl.LOCK_EX)", "print('held', flush=True)")
-    hold = "; ".join((*lines, "input()"))
+    take = "import sys, fcntl; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX)"
+    hold = f"{take}; print('held', flush=True); input()"
     command = [sys.executable, "-c", hold, str(tmp_path / ".lock")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
