@@ -63,7 +63,7 @@ class FrameReader(DatasetReader):
         self._columns = self._open()
 
     def get_item(self, idx: int) -> dict[str, Any]:
-        """The sample of row ``idx`` of the selected episodes, as ``DatasetReader.get_item`` gives it."""
+        """The sample of row ``idx`` of the selected episodes, made in the steps of ``DatasetReader.get_item``."""
         episode, index = (self._columns.read(key, idx).item() for key in ("episode_index", "index"))
         query, padding = (None, {}) if self.delta_indices is None else self._get_query_indices(index, episode)
         known = {} if self._live is None else self._live[idx]
