@@ -14,7 +14,7 @@ from dataset_tools.demonstrations import Demonstrations, read_demonstrations
 from dataset_tools.fitness import Distance
 from dataset_tools.genetic import GeneticOptions
 from dataset_tools.keyframes import MOST, KeyframeOptions, Keyframing, extract
-from dataset_tools.replay import read_scenes, replay
+from dataset_tools.replay import read_scenes, replay, without_failures
 from dataset_tools.report import Report
 from dataset_tools.shards import write_json
 from dataset_tools.signals import PauseOptions
@@ -146,11 +146,3 @@ def replay_all(demonstrations: Demonstrations, found: Mapping[int, Keyframing], 
     scenes = read_scenes(source.root, source.meta.total_episodes)
     actions = {number: labels(trajectories[number], one.keyframes[1:]) for number, one in found.items()}
     return dict(progress.track(replay(scenes, actions), total=len(actions), description="replaying"))
-
-
-def without_failures(found: Mapping[int, Keyframing], failures: Mapping[int, str]) -> dict[int, Keyframing]:
-    """The episodes whose key poses succeeded; ValueError if there is none."""
-    kept = {number: one for number, one in found.items() if not failures[number]}
-    if not kept:
-        raise ValueError(f"no episode's key poses succeed ({failures}); a smaller --epsilon keeps more of them")
-    return kept

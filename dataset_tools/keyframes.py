@@ -69,7 +69,7 @@ class Keyframing:
         error_max: largest distance [m].
         optimum_mean: ``error_mean`` of the best selection with as many keyframes, by the dynamic program [m].
         gap: how much larger the summed error is than the optimum's, as a ratio; 0 when both vanish.
-        seconds: time taken, without reading the data.
+        seconds: processor time taken, without reading the data.
         warning: empty, or why the error or the number of keyframes is not as asked.
     """
 
@@ -92,7 +92,7 @@ def extract(trajectory: Trajectory, options: KeyframeOptions, episode: int = 0) 
     """
     if len(trajectory) < FEWEST:
         raise ValueError(f"the episode has {len(trajectory)} frame(s); a macro step needs at least {FEWEST}")
-    begin = time.perf_counter()
+    begin = time.thread_time()
     mandatory = mandatory_keyframes(trajectory, options.pause)
     frames = moving_frames(mandatory)
     nodes = _thinned(frames, mandatory, options.nodes)
@@ -112,7 +112,7 @@ def extract(trajectory: Trajectory, options: KeyframeOptions, episode: int = 0) 
         error_max=float(away.max()),
         optimum_mean=float(best.mean()),
         gap=_gap(problem.error(selection), problem.error(optimum)),
-        seconds=time.perf_counter() - begin,
+        seconds=time.thread_time() - begin,
         warning=_warning(len(mandatory), len(selection), float(away.mean()), options),
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from dataset_tools.keyframes import Keyframing
 from dataset_tools.record_place import RECORDING_FILE
 from lerobot_histmv import keys
 
@@ -67,6 +68,14 @@ def replay(scenes: Scenes, actions: Mapping[int, Float32[np.ndarray, "k a"]]) ->
             yield episode, _failure(env, rows)
     finally:
         env.close()
+
+
+def without_failures(found: Mapping[int, Keyframing], failures: Mapping[int, str]) -> dict[int, Keyframing]:
+    """The episodes whose key poses succeeded; ValueError if there is none."""
+    kept = {number: one for number, one in found.items() if not failures[number]}
+    if not kept:
+        raise ValueError(f"no episode's key poses succeed ({failures}); a smaller --epsilon keeps more of them")
+    return kept
 
 
 def _failure(env: Any, rows: Float32[np.ndarray, "k 8"]) -> str:

@@ -122,29 +122,36 @@ class Report:
         """A few lines for people."""
         total, unit = self.totals(), f"m{self.unit}"
         why = ", ".join(f"{count} {reason}" for reason, count in total["reasons"].items())
-        gap = total["median_gap"]
         lines = [
             f"{total['episodes']} episodes of {total['frames']} frames -> {total['keyframes']} keyframes "
             f"({total['keyframes_per_episode']:.1f} per episode), {total['rows']} rows",
             f"kept because of: {why}; the method ({self.options.method}) chose {100 * total['share_of_method']:.0f} %",
             f"error: mean {1000 * total['error_mean']:.2f} {unit} per moving frame, largest "
             f"{1000 * total['error_max']:.1f} {unit}; accepted {1000 * self.options.epsilon:g} {unit}",
-            "gap to the exact optimum: "
-            + (
-                f"median {100 * gap:.2f} % over {total['episodes_in_median_gap']} episodes"
-                if gap is not None
-                else "none"
-            )
-            + f" whose optimum is above {1000 * GAP_COUNTS_ABOVE:g} {unit} per frame",
-            f"time: {total['seconds_per_episode']:.3f} s per episode",
+            self._gap(),
+            f"processor time: {total['seconds_per_episode']:.3f} s per episode",
             "columns: " + ", ".join(f"{name} = {column}" for name, column in self.columns.chosen().items()),
         ]
         if self.failures:
             successes = total["replayed"] - total["replay_failures"]
             lines.append(f"replay: the key poses succeed in {successes} of {total['replayed']} episodes")
-        warnings = [f"episode {number}: {one.warning}" for number, one in self.episodes.items() if one.warning]
-        warnings += [f"episode {number}: replay failed: {why}" for number, why in self.failures.items() if why]
-        return [*lines, *(f"note: {notice}" for notice in self.notices), *(f"warning: {line}" for line in warnings)]
+        lines += [f"note: {notice}" for notice in self.notices]
+        return lines + [f"warning: {warning}" for warning in self._warnings()]
+
+    def _gap(self) -> str:
+        total = self.totals()
+        limit = f"whose optimum is above {1000 * GAP_COUNTS_ABOVE:g} m{self.unit} per frame"
+        if total["median_gap"] is None:
+            return f"gap to the exact optimum: not told, as there is no episode {limit}"
+        median, count = 100 * total["median_gap"], total["episodes_in_median_gap"]
+        return f"gap to the exact optimum: median {median:.2f} % over {count} episodes {limit}"
+
+    def _warnings(self) -> list[str]:
+        found = [f"episode {number}: {one.warning}" for number, one in self.episodes.items() if one.warning]
+        for number, why in self.failures.items():
+            fate = "kept" if number in self.episodes else "left out"
+            found += [f"episode {number}: its key poses fail in replay ({why}); {fate}"] if why else []
+        return found
 
     def markdown(self) -> str:
         """The report as a Markdown page."""

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 import lerobot_histmv.envs
-from dataset_tools.replay import Scenes, read_scenes, replay
+from dataset_tools.columns import Column, Columns
+from dataset_tools.keyframes import KeyframeOptions, extract
+from dataset_tools.replay import Scenes, read_scenes, replay, without_failures
+from dataset_tools.report import Report
+from dataset_tools.signals import Trajectory
 
 SCENES = Scenes("push_buttons", seeds=(11, 13, 17), variations=(2, 3, 5))
 
@@ -67,3 +71,18 @@ def test_scenes_are_read_from_the_recording(tmp_path: Path) -> None:
     assert read_scenes(tmp_path, 3) == SCENES
     with pytest.raises(ValueError, match="tells 3 of 2"):
         read_scenes(tmp_path, 2)
+
+
+def test_what_fails_in_replay_is_told_with_what_became_of_it() -> None:
+    columns = Columns(Column("state", (0, 1, 2)), False, None, "", None, None)
+    one = extract(Trajectory(np.linspace([0.0, 0, 0], [1, 0, 0], 7), 20.0), KeyframeOptions())
+    kept = {0: one, 2: one}
+    report = Report(KeyframeOptions(), "me/demos", columns, kept, {0: "", 1: "grasp missed", 2: "time"}, [])
+    told = "\n".join(report.summary())
+    assert "succeed in 1 of 3 episodes" in told
+    assert "episode 1: its key poses fail in replay (grasp missed); left out" in told
+    assert "episode 2: its key poses fail in replay (time); kept" in told
+    assert report.as_json()["replay"] == {"0": "", "1": "grasp missed", "2": "time"}
+    assert without_failures({0: one, 1: one}, {0: "", 1: "time"}) == {0: one}
+    with pytest.raises(ValueError, match="no episode's key poses succeed"):
+        without_failures({1: one}, {1: "time"})
