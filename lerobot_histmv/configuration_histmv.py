@@ -74,13 +74,14 @@ class HistMVConfig(PreTrainedConfig):
             raise ValueError(
                 f"dataset lacks the camera calibration {missing}; histmv lifts pixels to world points with it"
             )
-        cameras = keys.cameras_of(features[keys.INTRINSICS]["names"])
+        cameras = keys.cameras_of(features[keys.INTRINSICS]["names"] or [])
         for key, names in (
             (keys.INTRINSICS, keys.intrinsics_names(cameras)),
             (keys.EXTRINSICS, keys.extrinsics_names(cameras)),
         ):
-            if list(features[key]["names"]) != names:
-                raise ValueError(f"{key} has names {features[key]['names']}, but histmv needs {names}")
+            found = features[key]["names"]
+            if not found or list(found) != names:
+                raise ValueError(f"{key} has names {found}, but histmv needs {names or 'CAMERA.fx, CAMERA.fy, ...'}")
         if self.cameras and self.cameras != cameras:
             raise ValueError(f"policy.cameras={self.cameras} differ from the dataset's calibrated cameras {cameras}")
         self.cameras = cameras

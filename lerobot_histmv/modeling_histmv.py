@@ -57,6 +57,20 @@ class HistMVPolicy(PreTrainedPolicy):
         self._warned: set[str] = set()
         self.reset()
 
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: "HistMVPolicy", model_file: str, map_location: str, strict: bool
+    ) -> "HistMVPolicy":
+        """Load weights, always strictly: LeRobot would only log what is missing and act with random weights.
+
+        Raises:
+            ValueError: the checkpoint was made with another configuration.
+        """
+        try:
+            return super()._load_as_safetensor(model, model_file, map_location, strict=True)
+        except RuntimeError as error:
+            raise ValueError(f"checkpoint {model_file} was made with another configuration: {error}") from error
+
     def get_optim_params(self) -> Any:
         """All trainable parameters."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]

@@ -60,11 +60,15 @@ class CheckInputStep(ProcessorStep):
             key = keys.depth_key(camera)
             observation[key] = observation[key].to(torch.float32)
             check_depth(key, observation[key])
+            check_colours(keys.rgb_key(camera), observation[keys.rgb_key(camera)])
         for key in (keys.STATE, keys.INTRINSICS, keys.EXTRINSICS):
             if key not in observation:
                 raise ValueError(f"observation lacks {key!r}")
+            if observation[key].ndim == 1:  # LeRobot's batching step knows state and images only
+                observation[key] = observation[key][None]
             check_finite(key, observation[key])
         check_unit(keys.STATE, observation[keys.STATE])
+        check_calibration(observation[keys.INTRINSICS], observation[keys.EXTRINSICS], self.cameras)
         action = new.get(TransitionKey.ACTION)
         if isinstance(action, Tensor):
             check_finite(keys.ACTION, action)
@@ -104,12 +108,37 @@ def check_depth(key: str, depth: Tensor) -> None:
         )
 
 
+def check_colours(key: str, colours: Tensor) -> None:
+    """Raise ValueError if colours are not finite or exceed [0, 1]."""
+    largest = colours.amax()
+    check_finite(key, largest)
+    if largest > 1 + 1e-3:
+        raise ValueError(f"{key} reaches {float(largest):.3g}, but colours must lie in [0, 1]; divide bytes by 255")
+
+
+def check_calibration(intrinsics: Tensor, extrinsics: Tensor, cameras: list[str]) -> None:
+    """Raise ValueError if the calibration is of another number of cameras, or no camera could have it."""
+    for key, values, count in ((keys.INTRINSICS, intrinsics, 4), (keys.EXTRINSICS, extrinsics, 12)):
+        if values.shape[-1] != count * len(cameras):
+            raise ValueError(f"{key} holds {values.shape[-1]} numbers, but the cameras {cameras} need {count} each")
+    focal = intrinsics.unflatten(-1, (-1, 4))[..., :2]
+    if (focal <= 0).any():
+        raise ValueError(
+            f"{keys.INTRINSICS} holds the focal length {float(focal.min()):.3g}; it must be above 0 pixels"
+        )
+    rotation = extrinsics.unflatten(-1, (-1, 3, 4))[..., :3]
+    away = rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    if (away.abs() > UNIT_TOLERANCE).any():
+        raise ValueError(f"{keys.EXTRINSICS} holds a matrix that is no rotation; it must be the rows of T_world_cam")
+
+
 def check_unit(key: str, vectors: Tensor) -> None:
     """Raise ValueError if the quaternions (components 3 to 6) of ``vectors`` are not unit."""
-    norms = vectors[..., 3:7].norm(dim=-1)
-    if ((norms - 1).abs() > UNIT_TOLERANCE).any():
+    norms = vectors[..., 3:7].norm(dim=-1).flatten()
+    away = (norms - 1).abs()
+    if (away > UNIT_TOLERANCE).any():
         raise ValueError(
-            f"{key} holds a quaternion of norm {float(norms.min()):.3g}; it must be unit, in the order w, x, y, z"
+            f"{key} holds a quaternion of norm {float(norms[away.argmax()]):.3g}; it must be unit, in the order w, x, y, z"
         )
 
 

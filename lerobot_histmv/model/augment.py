@@ -86,6 +86,7 @@ def shift_pixels(
 ) -> tuple[Float[Tensor, "n k 3 y x"], Float[Tensor, "n k y x"], Float[Tensor, "n k 4"]]:
     """Shift each view by whole pixels and its principal point with it; uncovered pixels become 0 (invalid depth)."""
     n, k, rows, columns = depth.shape
+    most = min(most, rows - 1, columns - 1)
     steps = torch.randint(-most, most + 1, (n, k, 2))
     new_rgb, new_depth = torch.zeros_like(rgb), torch.zeros_like(depth)
     for i, j in torch.cartesian_prod(torch.arange(n), torch.arange(k)).tolist():

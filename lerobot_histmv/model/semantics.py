@@ -29,23 +29,30 @@ def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
     Raises:
         ValueError: unknown model, or weights that are neither cached nor reachable.
     """
-    if model == "tiny":
-        clip = open_clip.CLIP(**TINY)
-        if pretrained is not None:
-            open_clip.load_checkpoint(clip, pretrained)
-        return clip
-    if model not in open_clip.list_models():
+    if model != "tiny" and model not in open_clip.list_models():
         raise ValueError(
             f"semantics.clip_model={model!r} is unknown; choose 'tiny' or one of {open_clip.list_models()}"
         )
     try:
-        return open_clip.create_model(model, pretrained=pretrained)
+        if model != "tiny":
+            return open_clip.create_model(model, pretrained=pretrained)
+        clip = open_clip.CLIP(**TINY)
+        if pretrained is not None:
+            open_clip.load_checkpoint(clip, pretrained)
+        return clip
     except (OSError, RuntimeError) as error:
         known = open_clip.list_pretrained_tags_by_model(model)
         raise ValueError(
             f"cannot load semantics.clip_pretrained={pretrained!r} of {model!r} ({error}). Accepted: a local weights "
             f"file, or one of the tags {known} if it is cached or the Hub is reachable; clip_model='tiny' needs neither"
         ) from error
+
+
+def text_parts(clip: open_clip.CLIP) -> list[nn.Module | nn.Parameter]:
+    """What only the text tower uses."""
+    if hasattr(clip, "text"):
+        return [clip.text]
+    return [clip.transformer, clip.token_embedding, clip.positional_embedding, clip.ln_final, clip.text_projection]
 
 
 class ClipTowers(nn.Module):
@@ -60,6 +67,10 @@ class ClipTowers(nn.Module):
         self.trained = config.trained
         self.clip.requires_grad_(self.trained)
         self.clip.logit_scale.requires_grad_(False)  # only a contrastive loss would use it
+        if config.text != "clip":
+            for part in text_parts(self.clip):
+                part.requires_grad_(False)
+        self.train(self.trained)
         context = TINY["text_cfg"]["context_length"] if config.clip_model == "tiny" else None
         self.tokenizer = open_clip.get_tokenizer(
             "ViT-B-32" if config.clip_model == "tiny" else config.clip_model, context_length=context

@@ -93,13 +93,14 @@ class ViewAttention(nn.Module):
     def forward(
         self, maps: Float[Tensor, "n k d h w"], text: Float[Tensor, "n c"], present: Bool[Tensor, "n k"]
     ) -> Float[Tensor, "n k"]:
-        """Softmax weights w over the ``present`` views; absent ones get 0."""
+        """Softmax weights w over the ``present`` views; absent ones get 0, unless no view is present."""
         pooled = torch.cat(
             [reduce(maps, "n k d h w -> n k d", "mean"), reduce(maps, "n k d h w -> n k d", "max")], dim=-1
         )
         text = functional.layer_norm(text, text.shape[-1:])
         scores = self.score(torch.cat([pooled, repeat(text, "n c -> n k c", k=maps.shape[1])], dim=-1))
-        return rearrange(scores, "n k 1 -> n k").masked_fill(~present, -math.inf).softmax(dim=-1)
+        usable = present | ~present.any(dim=-1, keepdim=True)  # no view at all must not turn weights into NaN
+        return rearrange(scores, "n k 1 -> n k").masked_fill(~usable, -math.inf).softmax(dim=-1)
 
     def redundancy(self, maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """L_MI per sample; gradients reach the weights only, so features cannot win by turning into noise."""
@@ -170,6 +171,7 @@ def ranking_loss(weights: Float[Tensor, "n k"], losses: Float[Tensor, "n k"]) ->
 
     The temperature follows the step's mean loss, so that late in training small differences still count.
     """
-    scale = RANKING_TEMPERATURE * losses.mean(dim=-1, keepdim=True) + 1e-6
-    wanted = (-losses / scale).detach().masked_fill(weights <= 0, -math.inf).softmax(dim=-1)
+    mean = (losses * even_shares(weights)).sum(dim=-1, keepdim=True)
+    wanted = -losses / (RANKING_TEMPERATURE * mean + 1e-6)
+    wanted = wanted.detach().masked_fill(weights <= 0, -math.inf).softmax(dim=-1)
     return -(wanted * weights.clamp_min(1e-6).log()).sum(dim=-1)

@@ -172,7 +172,6 @@ def test_paraphrases_come_from_the_dataset_unless_the_configuration_has_some(tmp
     assert config.instructions == {TASK: [TASK, "lift the red cube"]}
 
 
-@pytest.mark.xfail(strict=True, reason="the text tower of a trained CLIP is idle beside the sentence encoder")
 def test_no_weight_is_idle_beside_the_sentence_encoder() -> None:
     pytest.importorskip("transformers", reason="the sentence encoder is optional: transformers is not installed")
     network = tiny_network(semantics=SemanticsConfig(text="minilm"))

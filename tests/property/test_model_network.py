@@ -110,7 +110,6 @@ def test_view_without_valid_depth_is_never_chosen_and_its_colours_do_not_matter(
     assert_same(decide(net, replace(seen, depth=depth, rgb=rgb))[1], predicted)
 
 
-@pytest.mark.xfail(strict=True, reason="no view present: weights, and with them the action, are NaN")
 def test_scene_outside_of_the_workspace_gives_finite_numbers(net: HistMVNet) -> None:
     seen = tiny_observation(2, K, net.semantics.text_width)
     _, predicted, _ = decide(net, replace(seen, depth=seen.depth + 20))

@@ -101,7 +101,6 @@ def test_frozen_text_tower_encodes_each_sentence_once(weights_file: Path, monkey
     assert again[:3].equal(first)
 
 
-@pytest.mark.xfail(strict=True, reason="towers outside of the module tree are never put into evaluation mode")
 def test_frozen_towers_do_not_mix_the_images_of_a_batch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Batch normalisation (CLIP's ResNets) in training mode would make a view's vector depend on the other views."""
     resnet = {"image_size": 64, "width": 16, "layers": (1, 1, 1, 1), "head_width": 16}
@@ -112,7 +111,6 @@ def test_frozen_towers_do_not_mix_the_images_of_a_batch(monkeypatch: pytest.Monk
     torch.testing.assert_close(towers.images(rgb)[:, :1], towers.images(rgb[:, :1]), atol=1e-5, rtol=0)
 
 
-@pytest.mark.xfail(strict=True, reason="random frozen towers are not saved: a loaded policy would see other vectors")
 def test_frozen_random_weights_belong_to_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(semantics, "create_clip", lambda *_: open_clip.CLIP(**semantics.TINY))
     towers = Semantics(SemanticsConfig(clip_model="ViT-S-32-alt"))
@@ -133,7 +131,6 @@ def test_unknown_names_are_refused_with_what_is_accepted(changes: dict[str, str]
         Semantics(SemanticsConfig(**changes))
 
 
-@pytest.mark.xfail(strict=True, reason="a bare FileNotFoundError that does not name the setting")
 def test_missing_weights_of_the_tiny_architecture_are_named() -> None:
     with pytest.raises(ValueError, match=r"semantics\.clip_pretrained='nowhere/tiny\.pt'"):
         Semantics(SemanticsConfig(clip_pretrained="nowhere/tiny.pt"))
