@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Float
 
 from lerobot_histmv import geometry, keys
 from lerobot_histmv.envs.motion import Pose
@@ -80,7 +79,7 @@ def observation_space(cameras: Sequence[str], size: int) -> spaces.Dict:
     return spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-state, state), **depths, **calibration})
 
 
-def parse_action(action: Float[np.ndarray, " 8"]) -> tuple[Pose, float]:
+def parse_action(action: np.ndarray) -> tuple[Pose, float]:
     """Tool pose, clipped to the reachable box, and gripper command (0 or 1) of an action.
 
     Raises:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from lerobot_histmv.geometry import canonical
@@ -24,6 +23,9 @@ MAX_ACCELERATION = 3.0
 BLEND_RADIUS = 0.04
 """Distance from a via point at which the path leaves the straight line [m]."""
 SAMPLES_PER_SEGMENT = 64
+
+Point = Sequence[float] | Float[np.ndarray, " 3"]
+"""x, y, z [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class Pose:
         return Pose(self.position + np.array([0, 0, height]), self.quaternion)
 
 
-def top_down(position: ArrayLike, yaw: float = 0.0) -> Pose:
+def top_down(position: Point, yaw: float = 0.0) -> Pose:
     """Pose of a gripper that points straight down, its fingers apart along the y axis turned by ``yaw`` [rad]."""
     quaternion = canonical([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     return Pose(np.asarray(position, dtype=np.float64), quaternion)

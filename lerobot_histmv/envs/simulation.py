@@ -5,11 +5,10 @@ from collections.abc import Callable, Iterable, Mapping
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from lerobot_histmv.envs import scene
 from lerobot_histmv.envs.kinematics import JOINTS, ArmKinematics
-from lerobot_histmv.envs.motion import TICK, Pose, top_down
+from lerobot_histmv.envs.motion import TICK, Point, Pose, top_down
 from lerobot_histmv.geometry import quaternion_from_matrix
 
 HOME = top_down((0.28, 0.0, 0.40))
@@ -105,11 +104,11 @@ class Simulation:
         """Position [m] of an object's own one-degree-of-freedom joint."""
         return float(self.data.joint(f"{name}_joint").qpos[0])
 
-    def place_free(self, name: str, position: ArrayLike, yaw: float) -> None:
+    def place_free(self, name: str, position: Point, yaw: float) -> None:
         """Put an object that has a free joint somewhere."""
-        self.data.joint(f"{name}_joint").qpos[:] = [*np.asarray(position), np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        self.data.joint(f"{name}_joint").qpos[:] = [*position, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
 
-    def place_fixed(self, name: str, position: ArrayLike) -> None:
+    def place_fixed(self, name: str, position: Point) -> None:
         """Put an object that is fixed to the world somewhere."""
         self.model.body(f"{name}_body").pos[:] = position
 

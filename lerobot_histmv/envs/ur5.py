@@ -175,7 +175,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         self._capture()
         return self.observe(), self._info(ended=False)
 
-    def step(self, action: Float[np.ndarray, " 8"]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Go to ``action``; the class says what that means and what comes back."""
         pose, gripper = interface.parse_action(action)
         stage = self.stage

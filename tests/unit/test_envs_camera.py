@@ -54,8 +54,8 @@ def test_colour_and_calibration_agree_below_a_quarter_pixel(env: UR5Env, name: s
     renderer, simulation = env.stage.renderer, env.stage.simulation
     ball = env.stage.task.slots[0]
     for other in env.stage.task.slots[1:]:
-        simulation.place_fixed(other, (-1, 0, 0))
-    simulation.paint(ball, (0, 1, 0))
+        simulation.place_fixed(other, (-1.0, 0.0, 0.0))
+    simulation.paint(ball, (0.0, 1.0, 0.0))
     rng, errors = np.random.default_rng(0), []
     for _ in range(10):
         simulation.place_fixed(ball, rng.uniform([0.35, -0.15, 0.1], [0.55, 0.15, 0.1]))

@@ -30,7 +30,7 @@ def test_solutions_reach_their_targets(arm: ArmKinematics) -> None:
 
 
 def test_a_distant_target_has_no_solution(arm: ArmKinematics) -> None:
-    assert arm.solve(top_down((1.5, 0, 0.2)), ELBOW_UP) is None
+    assert arm.solve(top_down((1.5, 0.0, 0.2)), ELBOW_UP) is None
 
 
 def test_the_seed_is_left_alone(arm: ArmKinematics) -> None:

@@ -71,6 +71,6 @@ def test_macro_steps_of_a_motion_change_the_gripper_only_at_the_target() -> None
 
 def test_the_fingers_of_a_downward_tool_turn_with_yaw() -> None:
     yaw = 0.7
-    rotation = Rotation.from_quat(top_down((0, 0, 0), yaw).quaternion, scalar_first=True).as_matrix()
+    rotation = Rotation.from_quat(top_down((0.0, 0.0, 0.0), yaw).quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(rotation[:, 2], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(rotation[:, 0], [np.cos(yaw), np.sin(yaw), 0], atol=1e-12)

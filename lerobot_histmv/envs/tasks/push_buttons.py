@@ -74,7 +74,7 @@ class PushButtons(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Buttons at least 14 cm apart."""
         for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
-            simulation.place_fixed(name, (x, y, 0))
+            simulation.place_fixed(name, (x, y, 0.0))
         self._pressed: list[str] = []
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
