@@ -138,7 +138,8 @@ def check_unit(key: str, vectors: Tensor) -> None:
     away = (norms - 1).abs()
     if (away > UNIT_TOLERANCE).any():
         raise ValueError(
-            f"{key} holds a quaternion of norm {float(norms[away.argmax()]):.3g}; it must be unit, in the order w, x, y, z"
+            f"{key} holds a quaternion of norm {float(norms[away.argmax()]):.3g}; it must be unit, "
+            "in the order w, x, y, z"
         )
 
 
