@@ -92,11 +92,13 @@ def load_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
 
 
 def check_fits(policy: PreTrainedConfig, env: EnvConfig) -> None:
-    """Refuse an environment whose cameras, sizes or camera order the policy would fail on or, worse, misread.
+    """Refuse an environment whose cameras, sizes, camera order or control the policy would fail on or, worse, misread.
 
     Raises:
         ValueError: names what differs and the option that cures it.
     """
+    if policy.type == "histmv" and getattr(env, "control", "macro") != "macro":
+        raise ValueError(f"env.control={env.control}: an action of histmv is a whole motion; set --env.control=macro")
     offered = env_to_policy_features(env)
     wanted = policy.input_features or {}
     cameras, env_cameras = (list(getattr(config, "cameras", [])) for config in (policy, env))

@@ -38,7 +38,7 @@ class EvaluateConfig:
     eval: ScenesConfig = field(default_factory=ScenesConfig)
     # seed of the first scene, the others follow; recordings use seeds below 100000, training evaluates below 200000
     seed: int = REPORTED_SEEDS
-    # episodes per task to film, the first ones; a film costs about as much time as its episode
+    # episodes per task to film, the first ones; a filmed episode takes several times as long
     videos: int = 10
     # where the results go; what an earlier run left there for the same checkpoint and settings is kept and completed
     output_dir: Path | None = None
