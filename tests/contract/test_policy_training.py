@@ -163,13 +163,30 @@ def test_training_draws_among_paraphrases_and_evaluation_does_not(monkeypatch: p
     assert set(heard) == set(options)
 
 
-def test_paraphrases_come_from_the_dataset_unless_the_configuration_has_some(tmp_path: Path) -> None:
+def test_paraphrases_come_from_the_dataset(tmp_path: Path) -> None:
     path = tmp_path / keys.INSTRUCTIONS_FILE
     path.parent.mkdir()
     path.write_text('{"pick up the red cube": ["lift the red cube"]}')
     config = tiny_config(instructions={})
     tiny_policy(config, dataset_meta=dataset_meta([1], tmp_path))
     assert config.instructions == {TASK: [TASK, "lift the red cube"]}
+
+
+@pytest.mark.xfail(strict=True, reason="the dataset's table, even an empty one, replaces the configuration's")
+def test_paraphrases_of_the_configuration_survive_a_dataset_without_any(tmp_path: Path) -> None:
+    config = tiny_config(instructions={TASK: [TASK, "lift the red cube"]})
+    tiny_policy(config, dataset_meta=dataset_meta([1], tmp_path))
+    assert config.instructions == {TASK: [TASK, "lift the red cube"]}
+
+
+@pytest.mark.xfail(strict=True, reason="mutual information mixes bfloat16 and float32; so would positions")
+def test_mixed_precision_trains() -> None:
+    policy = tiny_policy().train()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss, log = policy(training_batch())
+    loss.backward()
+    assert loss.isfinite()
+    assert all(math.isfinite(value) for value in log.values())
 
 
 def test_no_weight_is_idle_beside_the_sentence_encoder() -> None:
