@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from datasets import Dataset
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
@@ -112,23 +111,25 @@ def _rows(
     """Columns of one episode's rows by name (arrays, camera frames, instructions), and warnings."""
     seen = keyframing.keyframes[:-1]
     frames = [keyframe.observation_frame for keyframe in seen]
+    kept = [key for key in observed(source) if source.features[key]["dtype"] != "video"]
+    stored = source.table(episode, [*kept, "timestamp", "task_index"], frames)
     rows: dict[str, Any] = {}
     warnings = []
     for key in observed(source):
-        feature = source.features[key]
-        if feature["dtype"] not in ("image", "video"):
-            rows[key] = np.array(source.column(episode, key, frames), dtype=_numpy_type(feature["dtype"]))
+        dtype = source.features[key]["dtype"]
+        if dtype not in ("image", "video"):
+            rows[key] = np.array(stored.column(key).to_pylist(), dtype=object if dtype == "string" else dtype)
             continue
-        rows[key] = camera_frames(source, episode, key, frames)
+        rows[key] = camera_frames(source, episode, key, frames, stored)
         if key in source.depth_keys:
             blank = np.flatnonzero(~rows[key].pixels.any(axis=(1, 2, 3)))
             warnings += [f"episode {episode}, frame {frames[i]}: {key} has no valid depth at all" for i in blank]
     rows[keys.ACTION] = labels(trajectory, keyframing.keyframes[1:])
     rows[keys.SOURCE_EPISODE] = np.full(len(frames), episode)
     rows[keys.SOURCE_FRAME] = np.array(frames)
-    rows[keys.SOURCE_TIMESTAMP] = np.array(source.column(episode, "timestamp", frames), dtype=np.float32)
+    rows[keys.SOURCE_TIMESTAMP] = np.array(stored.column("timestamp").to_pylist(), dtype=np.float32)
     rows[keys.REASON] = np.array([keys.REASONS.index(keyframe.reason) for keyframe in seen])
-    rows["task"] = source.tasks(episode, frames)
+    rows["task"] = [source.task(index) for index in stored.column("task_index").to_pylist()]
     return rows, warnings
 
 
@@ -148,7 +149,7 @@ def _table(rows: Mapping[str, Any], tasks: list[str], meta: LeRobotDatasetMetada
     """Rows with LeRobot's counters, in the form of its data files."""
     count = np.arange(len(tasks))
     columns: dict[str, Any] = {
-        "timestamp": (count / meta.fps).astype(np.float32),
+        "timestamp": count / meta.fps,
         "frame_index": count,
         "episode_index": np.full_like(count, meta.total_episodes),
         "index": meta.total_frames + count,
@@ -159,11 +160,16 @@ def _table(rows: Mapping[str, Any], tasks: list[str], meta: LeRobotDatasetMetada
             columns[key] = [{"bytes": file, "path": None} for file in column.files]
         else:
             columns[key] = column.reshape(len(column)) if tuple(meta.features[key]["shape"]) == (1,) else column
-    return Dataset.from_dict(columns, features=get_hf_features_from_features(meta.features)).with_format("arrow")[:]
+    schema = get_hf_features_from_features(meta.features).arrow_schema
+    return pa.table([_cells(columns[field.name], field.type) for field in schema], schema=schema)
 
 
-def _numpy_type(dtype: str) -> Any:
-    return object if dtype == "string" else np.dtype(dtype)
+def _cells(column: Any, kind: pa.DataType) -> pa.Array:
+    """Arrow array of a column; LeRobot keeps matrices as an extension of nested lists."""
+    values = column.tolist() if isinstance(column, np.ndarray) else column
+    if isinstance(kind, pa.BaseExtensionType):
+        return pa.ExtensionArray.from_storage(kind, pa.array(values, kind.storage_type))
+    return pa.array(values, kind)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float, UInt8, UInt16
 from lerobot.configs.video import DepthEncoderConfig
 from lerobot.datasets.depth_utils import dequantize_depth
@@ -32,18 +33,25 @@ class CameraFrames:
     pixels: UInt8[np.ndarray, "n y x 3"] | UInt16[np.ndarray, "n y x 1"]
 
 
-def camera_frames(source: Source, episode: int, key: str, frames: Sequence[int]) -> CameraFrames:
-    """Frames of camera ``key`` at strictly rising ``frames`` of an episode.
+def camera_frames(source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table) -> CameraFrames:
+    """Frames of one camera.
+
+    Args:
+        source: the dataset.
+        episode: which episode.
+        key: which camera.
+        frames: which frames, strictly rising.
+        stored: the episode's table at these frames, with ``timestamp`` and, unless it is a video, ``key``.
 
     Raises:
         ValueError: frames that cannot be read, or depth that is not a number; the message names episode, frame and key.
     """
     if key in source.depth_keys:
-        return _depth(source, episode, key, frames)
+        return _depth(source, episode, key, frames, stored)
     if source.features[key]["dtype"] == "video":
-        pixels = np.moveaxis(_decoded(source, episode, key, frames), 1, -1)
+        pixels = np.moveaxis(_decoded(source, episode, key, frames, stored), 1, -1)
         return CameraFrames([encode_rgb(image) for image in pixels], pixels)
-    files = _stored(source, episode, key, frames)
+    files = _files(stored, episode, key)
     return CameraFrames(files, np.stack([np.asarray(Image.open(io.BytesIO(file)).convert("RGB")) for file in files]))
 
 
@@ -60,12 +68,12 @@ def millimetres(depth: Float[np.ndarray, "y x"], unit: str, where: str) -> UInt1
     return np.where(scaled > _LARGEST_MM, 0, scaled).astype(np.uint16)
 
 
-def _depth(source: Source, episode: int, key: str, frames: Sequence[int]) -> CameraFrames:
+def _depth(source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table) -> CameraFrames:
     info = source.features[key].get("info") or {}
     if source.features[key]["dtype"] == "video":
-        raw, unit = _dequantized(_decoded(source, episode, key, frames), info), "m"
+        raw, unit = _dequantized(_decoded(source, episode, key, frames, stored), info), "m"
     else:
-        files = _stored(source, episode, key, frames)
+        files = _files(stored, episode, key)
         raw = np.stack([np.asarray(Image.open(io.BytesIO(file))) for file in files])
         unit = info.get("depth_unit") or ("mm" if np.issubdtype(raw.dtype, np.integer) else "m")
         if raw.dtype == np.uint16 and unit == "mm":
@@ -77,8 +85,8 @@ def _depth(source: Source, episode: int, key: str, frames: Sequence[int]) -> Cam
     return CameraFrames([encode_depth(image[..., None]) for image in depth], np.stack(depth)[..., None])
 
 
-def _stored(source: Source, episode: int, key: str, frames: Sequence[int]) -> list[bytes]:
-    files = [cell["bytes"] for cell in source.column(episode, key, frames)]
+def _files(stored: pa.Table, episode: int, key: str) -> list[bytes]:
+    files = [cell["bytes"] for cell in stored.column(key).to_pylist()]
     if not all(files):
         raise ValueError(f"episode {episode}: {key} has frames whose image is not embedded in the data files")
     return files
@@ -99,10 +107,10 @@ def _dequantized(codes: np.ndarray, info: dict[str, object]) -> Float[np.ndarray
     return np.where(codes > 0, metres, 0).reshape(len(codes), *codes.shape[-2:])
 
 
-def _decoded(source: Source, episode: int, key: str, frames: Sequence[int]) -> np.ndarray:
+def _decoded(source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table) -> np.ndarray:
     """Raw frames (n, channels, y, x) of a video: uint8 RGB, or 12-bit depth codes."""
     begin = source.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-    stamps = [begin + stamp for stamp in source.column(episode, "timestamp", frames)]
+    stamps = [begin + stamp for stamp in stored.column("timestamp").to_pylist()]
     path = source.root / source.meta.get_video_file_path(episode, key)
     is_depth = key in source.depth_keys
     try:

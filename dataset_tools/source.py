@@ -40,10 +40,6 @@ class Source:
         """Frames of an episode."""
         return int(self.meta.episodes[episode]["length"])
 
-    def column(self, episode: int, key: str, frames: Sequence[int] | None = None) -> list[Any]:
-        """Stored values of a column at ``frames`` (all by default), one entry per frame."""
-        return self.table(episode, [key], frames).column(key).to_pylist()
-
     def table(self, episode: int, columns: Sequence[str], frames: Sequence[int] | None = None) -> pa.Table:
         """Stored columns at strictly rising ``frames`` of an episode (all by default).
 
@@ -99,9 +95,9 @@ class Source:
                 )
         return {episode: self.vectors(episode) for episode in self.episodes}
 
-    def tasks(self, episode: int, frames: Sequence[int]) -> list[str]:
-        """Instruction at each frame."""
-        return [str(self.meta.tasks.iloc[index].name) for index in self.column(episode, "task_index", frames)]
+    def task(self, index: int) -> str:
+        """Instruction that a ``task_index`` stands for."""
+        return str(self.meta.tasks.iloc[index].name)
 
 
 def open_source(

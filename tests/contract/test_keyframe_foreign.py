@@ -130,6 +130,30 @@ def arm_frames(count: int = 31) -> list[Frame]:
     return frames_with(observation__state=values, action=values)
 
 
+def test_text_matrices_and_integers_of_an_observation_are_kept(tmp_path: Path) -> None:
+    features = ARM_FEATURES | {
+        "observation.note": {"dtype": "string", "shape": (1,), "names": None},
+        "observation.frame_of_tool": {"dtype": "float32", "shape": (2, 3), "names": None},
+        "observation.contact": {"dtype": "int64", "shape": (1,), "names": None},
+    }
+    frames = [
+        {
+            **frame,
+            "observation.note": f"frame {i}",
+            "observation.frame_of_tool": np.arange(6, dtype=np.float32).reshape(2, 3) + i,
+            "observation.contact": np.array([i % 2]),
+        }
+        for i, frame in enumerate(arm_frames())
+    ]
+    dense = write(tmp_path / "dense", [frames], features, paraphrases=False)
+    rows = keyframed(dense, columns=ColumnsConfig(joints="observation.state:0:3"), epsilon=0.01)
+    for row in rows:
+        frame = int(row[keys.SOURCE_FRAME])
+        assert row["observation.note"] == f"frame {frame}"
+        assert row["observation.frame_of_tool"].tolist() == frames[frame]["observation.frame_of_tool"].tolist()
+        assert int(row["observation.contact"]) == frame % 2
+
+
 ARM_FEATURES = {keys.STATE: vector_feature(ARM), keys.ACTION: vector_feature(ARM)}
 
 
