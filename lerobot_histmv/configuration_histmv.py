@@ -116,12 +116,12 @@ class HistMVConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> list[int]:
-        """The window: s past steps and the current one."""
-        return list(range(-self.network.history.past_steps, 1))
+        """Steps from s before to s after the drawn one, from which the policy picks a window."""
+        return list(range(-self.network.history.past_steps, self.network.history.past_steps + 1))
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """A target for every step of the window."""
+        """A target for every step."""
         return self.observation_delta_indices
 
     @property

@@ -15,12 +15,14 @@ from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data.instructions import load_paraphrases
 from lerobot_histmv.model import augment, losses
-from lerobot_histmv.model.layers import masked_mean
+from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
-from lerobot_histmv.model.view_attention import choice_loss, choose_views, ranking_loss
-from lerobot_histmv.windows import Window, causal_heat, read_window
+from lerobot_histmv.model.view_attention import best_shares, choice_loss, choose_views, ranking_loss
+from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
 
 Batch = dict[str, Any]
+MEANINGS = 12
+"""Instructions that one training step tells apart."""
 
 
 @dataclass
@@ -49,11 +51,9 @@ class HistMVPolicy(PreTrainedPolicy):
     def __init__(self, config: HistMVConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        if dataset_meta is not None:  # fine-tuning adds to what the checkpoint knows
-            config.instructions |= load_paraphrases(dataset_meta.root, dataset_meta.tasks.index)
+        if dataset_meta is not None:  # what the configuration or a checkpoint knows stays
+            config.instructions = load_paraphrases(dataset_meta.root, dataset_meta.tasks.index) | config.instructions
         self.net = HistMVNet(config.network, config.image_size)
-        ends = [] if dataset_meta is None else dataset_meta.episodes["dataset_to_index"]
-        self.register_buffer("episode_ends", torch.tensor(ends, dtype=torch.long), persistent=False)
         self._warned: set[str] = set()
         self.reset()
 
@@ -86,16 +86,17 @@ class HistMVPolicy(PreTrainedPolicy):
         """Loss over every real step of the windows, each row of the dataset counting once.
 
         Args:
-            batch: windows of s + 1 rows, old to new, as LeRobot's loader and the preprocessor give them.
+            batch: 2s + 1 rows around each drawn row, as LeRobot's loader and the preprocessor give them.
             reduction: "mean" for a scalar, "none" for one loss per window.
         """
         config = self.config
         window = read_window(batch, config.cameras)
-        if self.training:
-            window = self._augment(window)
         sentences = self._paraphrase(batch["task"]) if self.training else batch["task"]
         text = self.net.semantics.text(sentences, window.real.device)
-        seen = window.observe(text)
+        with full_precision(window.depth):
+            if self.training:
+                window = self._augment(window)
+            seen = window.observe(text)
         choice = config.network.views.train_choice if self.training else "argmax"
         encoding, predicted, views, shares = self.net(seen, window.real, choice)
 
@@ -103,22 +104,25 @@ class HistMVPolicy(PreTrainedPolicy):
         target = window.target
         terms = losses.action_losses(predicted, target[step], encoding.cloud[step, view], config.loss)
         per_pair = losses.weighted_sum(terms, config.loss)
+        if choice == "ranked":
+            shares = best_shares(encoding.weights.detach(), per_pair)
         nothing = torch.zeros_like(seen.heat[:, 0])
         terms = {name: nothing.index_add(0, step, shares * term) for name, term in terms.items()}
         terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
             terms["choice"] = self._choice_loss(encoding, seen.text, view, per_pair)
+        if self.training and self.net.semantics.text_is_trained:
+            terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 
-        rows = self._row_weights(batch, window.real)
+        rows = row_weights(window.real, batch["frame_index"], config.network.history.past_steps)
         log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
         error = (predicted.position - target[step, :3]).norm(dim=-1)
         log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
         log |= {f"view_{name}": w.item() for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
         if reduction == "none":
             owner = window.real.nonzero()[:, 0]
-            total = torch.zeros(len(window.real), device=per_step.device)
-            return total.index_add(0, owner, per_step * rows) / total.index_add(0, owner, rows), log
+            return torch.zeros(len(window.real), device=per_step.device).index_add(0, owner, per_step * rows), log
         return masked_mean(per_step, rows), log
 
     @torch.no_grad()
@@ -178,6 +182,15 @@ class HistMVPolicy(PreTrainedPolicy):
         choices = [self.config.instructions.get(sentence, [sentence]) for sentence in sentences]
         return [options[int(torch.randint(len(options), ()))] for options in choices]
 
+    def _paraphrase_loss(self, device: torch.device) -> Float[Tensor, ""]:
+        """Two wordings of each of a few random instructions, told apart by meaning."""
+        meanings = sorted({tuple(sorted(wordings)) for wordings in self.config.instructions.values()})
+        picked = torch.randperm(len(meanings))[:MEANINGS].tolist()
+        pairs = [torch.randperm(len(meanings[i]))[:2].tolist() for i in picked]
+        sentences = [meanings[i][j] for i, pair in zip(picked, pairs, strict=True) for j in pair]
+        owners = torch.tensor([i for i, pair in zip(picked, pairs, strict=True) for _ in pair], device=device)
+        return losses.paraphrase_loss(self.net.semantics.text(sentences, device), owners)
+
     def _known(self, sentences: list[str]) -> list[str]:
         """The sentences, with one warning for each that training never saw: it is encoded like any other."""
         known = {sentence for options in self.config.instructions.values() for sentence in options}
@@ -185,12 +198,3 @@ class HistMVPolicy(PreTrainedPolicy):
             logging.warning("instruction %r was not in the training data; the action relies on similar ones", sentence)
             self._warned.add(sentence)
         return sentences
-
-    def _row_weights(self, batch: Batch, real: Bool[Tensor, "b t"]) -> Float[Tensor, " n"]:
-        """One over the number of windows that hold each real row, so that every row counts once per epoch."""
-        if not len(self.episode_ends) or "index" not in batch:
-            return torch.ones(int(real.sum()), device=real.device)
-        age = torch.arange(real.shape[1] - 1, -1, -1, device=real.device)
-        left = self.episode_ends[batch["episode_index"]] - batch["index"]
-        windows = (left[:, None] + age).clamp(max=self.config.n_obs_steps)
-        return 1 / windows[real]

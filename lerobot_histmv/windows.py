@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from einops import rearrange, repeat
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_histmv import keys
@@ -94,8 +94,41 @@ class Window:
         return replace(self, rgb=rgb, depth=depth, intrinsics=intrinsics)
 
 
+def choose_rows(exist: Bool[Tensor, "b t"]) -> tuple[Bool[Tensor, "b u"], Bool[Tensor, "b t"]]:
+    """Windows of up to s + 1 rows, and the rows they pick from the 2s + 1 rows around each drawn row.
+
+    A window ends at the drawn row, or covers the first s + 1 rows of the episode if the drawn row is among them: all
+    steps of a short episode are learned together, instead of encoding its first rows again in each of many windows.
+
+    Args:
+        exist: which of the rows from s before to s after the drawn one lie in its episode.
+    """
+    before = (~exist).cumprod(dim=1).sum(dim=1)
+    columns = before[:, None] + torch.arange((exist.shape[1] + 1) // 2, device=exist.device)
+    real = exist.gather(1, columns)
+    picked = torch.zeros_like(exist).scatter(1, columns, real)
+    return real[:, real.any(dim=0)], picked  # a column that no window has would only cost attention
+
+
+def row_weights(
+    real: Bool[Tensor, "b u"], frame_index: Int[Tensor, " b"], past_steps: int
+) -> Float[Tensor, " n"]:
+    """Share of each real row in its window's loss: only rows whose whole history the window shows.
+
+    All rows of a window that begins with its episode share evenly, of a later one the last row counts alone. Over an
+    epoch, which draws every row once, every row so gets a weight of 1.
+    """
+    count = real.sum(dim=1, keepdim=True)
+    last = real.cumsum(dim=1) == count
+    return torch.where(frame_index[:, None] <= past_steps, 1 / count, last.float())[real]
+
+
 def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
-    """Pack a batch of windows (training) or of single observations (inference).
+    """Pack a batch of neighbourhoods (training) or of single observations (inference).
+
+    Args:
+        batch: what LeRobot's loader or environment gives: 2s + 1 rows around each drawn row, or one row.
+        cameras: views in the policy's order.
 
     Raises:
         ValueError: a camera of the policy is missing in the batch.
@@ -105,18 +138,17 @@ def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
     if missing:
         raise ValueError(f"observation lacks {missing}; the policy was made for the cameras {cameras}")
     state = batch[keys.STATE]
-    windowed = state.ndim == 3
-    real = torch.ones(state.shape[: state.ndim - 1], dtype=torch.bool, device=state.device)
-    if windowed and f"{keys.STATE}_is_pad" in batch:
-        real = ~batch[f"{keys.STATE}_is_pad"]
+    picked = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
+    real = picked.reshape(len(state), -1)
+    if state.ndim == 3:
+        real, picked = choose_rows(~batch[f"{keys.STATE}_is_pad"])
 
     def pick(key: str) -> Tensor:
-        return batch[key][real]
+        return batch[key][picked]
 
     depth = torch.stack([pick(keys.depth_key(camera)) for camera in cameras], dim=1)
     return Window(
-        # Columns that are padding in every window would only cost attention.
-        real=real[:, int(real.any(dim=0).int().argmax()) :] if windowed else real[:, None],
+        real=real,
         rgb=torch.stack([pick(keys.rgb_key(camera)) for camera in cameras], dim=1),
         depth=MILLIMETRE * rearrange(depth, "n k 1 y x -> n k y x"),
         intrinsics=rearrange(pick(keys.INTRINSICS), "n (k c) -> n k c", c=4),

@@ -43,8 +43,11 @@ def check_options(
     ):
         if value not in accepted:
             raise ValueError(f"{name} is {value!r}; accepted are {', '.join(accepted)}")
-    if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(CAMERA_NAMES):
-        raise ValueError(f"cameras are {list(cameras)}; they must be different names out of {', '.join(CAMERA_NAMES)}")
+    if not cameras or list(cameras) != [camera for camera in CAMERA_NAMES if camera in cameras]:
+        raise ValueError(
+            f"cameras are {list(cameras)}; they must be different names out of {', '.join(CAMERA_NAMES)}, in this order: "
+            "calibration is a plain vector, and another order would give every view another's camera"
+        )
     low, high = IMAGE_SIZES
     for name, size in (("image_size", image_size), ("render_size", render_size)):
         if not low <= size <= high:

@@ -87,7 +87,7 @@ class ViewConfig:
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
         mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
         train_choice: which views are decoded in training: "argmax"; "sampled" from w; "expected" (all, weighted by w);
-            "ranked" (all alike, w learns to rank them by their loss).
+            "ranked" (all, mostly those that decode a step well; w learns to rank them).
     """
 
     mi_loss: str = "nmi"
@@ -127,6 +127,7 @@ class LossConfig:
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
         choice: weight of the term that teaches the view weights which view decodes best.
+        paraphrase: weight of the term that teaches a trained text tower which sentences mean the same.
         gripper: "bce" or "mse" (as printed).
         position_unit: length [m] in which position errors are squared.
     """
@@ -135,6 +136,7 @@ class LossConfig:
     mutual_information: float = 0.01
     heatmap: float = 0.1
     choice: float = 0.1
+    paraphrase: float = 1.0
     gripper: str = "bce"
     position_unit: float = 0.1
 

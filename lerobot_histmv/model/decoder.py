@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_histmv.model.layers import ConvBlock, upsample_to
+from lerobot_histmv.model.layers import ConvBlock, full_precision, upsample_to
 
 TEMPERATURE = 0.1
 LOCAL_CHANNELS = 24
@@ -123,10 +123,11 @@ class Decoder(nn.Module):
             valid: pixels with a measurement inside the workspace.
         """
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
-        log_heat = spatial_log_softmax(logits, valid)
-        heat = log_heat.exp()
-        surface = einsum(heat, cloud, "m y x, m c y x -> m c")
-        numbers = self.pose(maps, view, decoded, heat.detach())
+        with full_precision(logits):
+            log_heat = spatial_log_softmax(logits.float(), valid)
+            heat = log_heat.exp()
+            surface = einsum(heat, cloud, "m y x, m c y x -> m c")
+        numbers = self.pose(maps, view, decoded, heat.detach()).float()
         return Prediction(
             position=surface + OFFSET_UNIT * numbers[:, :3],
             surface=surface,

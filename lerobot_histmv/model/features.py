@@ -42,7 +42,7 @@ class TimmBackbone(nn.Module):
 
     def __init__(self, name: str, channels_in: int, pretrained: bool) -> None:
         super().__init__()
-        if name not in timm.list_models():
+        if not timm.is_model(name):
             raise ValueError(f"texture.backbone={name!r} is neither 'plain' nor a model that timm knows")
         probe: Any = timm.create_model(name, features_only=True, in_chans=channels_in, pretrained=False)
         strides = probe.feature_info.reduction()

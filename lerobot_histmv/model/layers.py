@@ -51,6 +51,11 @@ class CrossAttention(nn.Module):
         return queries + self.mix(queries)
 
 
+def full_precision(like: Tensor) -> torch.autocast:
+    """Context for geometry and information inside mixed precision: half precision would round metres to millimetres."""
+    return torch.autocast(like.device.type, enabled=False)
+
+
 def masked_mean(values: Float[Tensor, "*s"], weights: Float[Tensor, "*s"]) -> Float[Tensor, ""]:
     """Weighted mean; 0 when all weights are 0."""
     return (values * weights).sum() / weights.sum().clamp_min(torch.finfo(values.dtype).tiny)

@@ -1,7 +1,7 @@
 """Named loss terms and their weighted sum (paper Eq. 9)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -9,7 +9,9 @@ from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
 
 HEAT_SIGMA = 0.015
-"""Width [m] of the target of the optional heat map loss around the true position."""
+"""Width [m] of the heat map's target around the surface point nearest the true position."""
+HEAT_REACH = 0.15
+"""Farthest [m] that surface may be: beyond it, the view is taken not to show what matters."""
 
 
 def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
@@ -22,14 +24,33 @@ def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"
 def heat_loss(
     log_heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"], target: Float[Tensor, "m 3"]
 ) -> Float[Tensor, " m"]:
-    """Cross-entropy to a Gaussian of pixels near the target position; 0 where the view sees nothing near it."""
-    distance = (cloud - target[:, :, None, None]).square().sum(dim=1)
+    """Cross-entropy to a Gaussian around the surface nearest the target; 0 where the view sees nothing near it.
+
+    Many key poses lie in free space, above the object that they are about: it is the nearest surface.
+    """
     seen = log_heat > -torch.inf
-    wanted = torch.exp(-0.5 * distance / HEAT_SIGMA**2) * seen
-    total = wanted.sum(dim=(-2, -1))
-    log_seen = torch.where(seen, log_heat, torch.zeros_like(log_heat))
-    entropy = -(wanted * log_seen).sum(dim=(-2, -1)) / total.clamp_min(1)
-    return torch.where(total > 1, entropy, torch.zeros_like(entropy))
+    distance = (cloud - target[:, :, None, None]).square().sum(dim=1).masked_fill(~seen, torch.inf).flatten(1)
+    near = distance.amin(dim=1) < HEAT_REACH**2
+    wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
+    log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
+    return torch.zeros_like(log_heat[:, 0, 0]).masked_scatter(near, -(wanted * log_seen).sum(dim=1))
+
+
+PARAPHRASE_TEMPERATURE = 0.1
+
+
+def paraphrase_loss(vectors: Float[Tensor, "n c"], meanings: Int[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Supervised contrastive loss: sentences of one meaning together, all others apart (Khosla et al. 2020, Eq. 2).
+
+    Args:
+        vectors: sentence vectors of unit length.
+        meanings: number of each sentence's meaning; sentences without a partner only serve as others.
+    """
+    itself = torch.eye(len(vectors), dtype=torch.bool, device=vectors.device)
+    logits = (vectors @ vectors.T / PARAPHRASE_TEMPERATURE).masked_fill(itself, -torch.inf)
+    partners = (meanings[:, None] == meanings) & ~itself
+    log_share = logits.log_softmax(dim=1).masked_fill(~partners, 0)
+    return -log_share.sum() / partners.sum().clamp_min(1)
 
 
 def action_losses(
@@ -67,6 +88,7 @@ def term_weights(config: LossConfig) -> dict[str, float]:
         "heatmap": config.heatmap,
         "mutual_information": config.mutual_information,
         "choice": config.choice,
+        "paraphrase": config.paraphrase,
     }
 
 

@@ -12,6 +12,7 @@ from lerobot_histmv.model.decoder import Decoder, Prediction
 from lerobot_histmv.model.features import POSE_STRIDE, STRIDE, RgbaFeatures
 from lerobot_histmv.model.fusion import TransFuse
 from lerobot_histmv.model.history import History
+from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.points import PointEncoder
 from lerobot_histmv.model.semantics import Semantics
 from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views
@@ -102,12 +103,12 @@ class HistMVNet(nn.Module):
 
     def encode(self, seen: Observation) -> Encoding:
         """Everything that depends on one step only: texture, semantics, points, fusion and view weights."""
-        size = seen.depth.shape[-2:]
-        cloud = deproject(seen.depth, seen.intrinsics, seen.extrinsics)
-        scaled, valid = self.workspace.normalise_map(cloud, seen.depth)
-        pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
-        cells = (size[0] // POSE_STRIDE, size[1] // POSE_STRIDE)
-        poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
+        cells = (seen.depth.shape[-2] // POSE_STRIDE, seen.depth.shape[-1] // POSE_STRIDE)
+        with full_precision(seen.depth):
+            cloud = deproject(seen.depth, seen.intrinsics, seen.extrinsics)
+            scaled, valid = self.workspace.normalise_map(cloud, seen.depth)
+            pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
+            poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
 
         features, skips = self.rgba(seen.rgb, scaled, poses, self.semantics.images(seen.rgb))
         points = self.points(cloud, seen.rgb, valid)

@@ -144,6 +144,7 @@ class Semantics(nn.Module):
         self._image_tower, self._text_tower = [towers], [text]
         self._cache: dict[str, Tensor] = {}
         self.image_width, self.text_width = towers.width, text.width
+        self.text_is_trained = text.trained
 
     def images(self, rgb: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k c"]:
         """Global vector FR_g of every view; colours in [0, 1]."""

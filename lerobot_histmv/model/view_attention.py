@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_histmv.model.config import ViewConfig
+from lerobot_histmv.model.layers import full_precision
 
 RIDGE = 1e-3
 
@@ -104,8 +105,9 @@ class ViewAttention(nn.Module):
 
     def redundancy(self, maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
         """L_MI per sample; gradients reach the weights only, so features cannot win by turning into noise."""
-        matrix = normalised_mutual_information(maps.detach(), self.projection)
-        return mutual_information_loss(weights, matrix, self.form)
+        with full_precision(maps):
+            matrix = normalised_mutual_information(maps.detach().float(), self.projection)
+            return mutual_information_loss(weights.float(), matrix, self.form)
 
 
 def fuse_views(maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, "n d h w"]:
@@ -118,8 +120,10 @@ def most_informative(weights: Float[Tensor, "n k"]) -> Int[Tensor, " n"]:
     return weights.argmax(dim=-1)
 
 
-EXPLORE = 0.5
+EXPLORE = 0.3
 """Share of training spread evenly over the present views: without it one view wins early and the others starve."""
+RANKING_TEMPERATURE = 0.3
+"""How many times smaller than the mean loss a difference between views must be to hardly matter."""
 
 
 def even_shares(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -128,9 +132,9 @@ def even_shares(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     return present / present.sum(dim=-1, keepdim=True)
 
 
-def explored(weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """Mixture of w and the uniform distribution over the present views."""
-    return (1 - EXPLORE) * weights + EXPLORE * even_shares(weights)
+def explored(shares: Float[Tensor, "n k"], weights: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Mixture of ``shares`` and the uniform distribution over the present views."""
+    return (1 - EXPLORE) * shares + EXPLORE * even_shares(weights)
 
 
 def choose_views(weights: Float[Tensor, "n k"], choice: str) -> tuple[Int[Tensor, "m 2"], Float[Tensor, " m"]]:
@@ -138,15 +142,18 @@ def choose_views(weights: Float[Tensor, "n k"], choice: str) -> tuple[Int[Tensor
 
     * "argmax": the most informative view.
     * "expected": every present view, its loss weighted by w, so that w learns which view decodes best.
-    * "ranked": every present view, all with equal shares; ``ranking_loss`` teaches w.
+    * "ranked": every present view, alike until their losses are known, see ``best_shares``; ``ranking_loss`` teaches w.
     * "sampled": one view drawn from w; ``choice_loss`` teaches w what "expected" does at 1/k of the cost.
     """
     n, k = weights.shape
     steps = torch.arange(n, device=weights.device)
     if choice in ("expected", "ranked"):
         pairs = torch.cartesian_prod(steps, torch.arange(k, device=weights.device))
-        return pairs, rearrange(explored(weights) if choice == "expected" else even_shares(weights), "n k -> (n k)")
-    picked = most_informative(weights) if choice == "argmax" else explored(weights).detach().multinomial(1)[:, 0]
+        shares = explored(weights, weights) if choice == "expected" else even_shares(weights)
+        return pairs, rearrange(shares, "n k -> (n k)")
+    picked = most_informative(weights)
+    if choice == "sampled":
+        picked = explored(weights, weights).detach().multinomial(1)[:, 0]
     return torch.stack([steps, picked], dim=-1), weights.new_ones(n)
 
 
@@ -159,19 +166,27 @@ def choice_loss(
     """
     centred = (losses - losses.mean()).detach()
     advantage = centred / (centred.square().mean().sqrt() + 1e-6)
-    return advantage * explored(weights).gather(1, picked[:, None])[:, 0].log()
+    return advantage * explored(weights, weights).gather(1, picked[:, None])[:, 0].log()
 
 
-RANKING_TEMPERATURE = 0.3
-"""How many times smaller than the mean loss a difference between views must be to hardly matter."""
-
-
-def ranking_loss(weights: Float[Tensor, "n k"], losses: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
-    """Cross-entropy between w and the views' softmin of their losses; its gradient never vanishes on a wrong choice.
+def loss_softmin(weights: Float[Tensor, "n k"], losses: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Softmin over the present views of the loss that each gave; without gradient.
 
     The temperature follows the step's mean loss, so that late in training small differences still count.
     """
     mean = (losses * even_shares(weights)).sum(dim=-1, keepdim=True)
-    wanted = -losses / (RANKING_TEMPERATURE * mean + 1e-6)
-    wanted = wanted.detach().masked_fill(weights <= 0, -math.inf).softmax(dim=-1)
-    return -(wanted * weights.clamp_min(1e-6).log()).sum(dim=-1)
+    scores = -losses / (RANKING_TEMPERATURE * mean + 1e-6)
+    return scores.detach().masked_fill(weights <= 0, -math.inf).softmax(dim=-1)
+
+
+def best_shares(weights: Float[Tensor, "n k"], losses: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """Shares of all (step, view) pairs that favour the views that decode a step well.
+
+    A view that does not show the target can only learn to guess; with equal shares that guessing outweighs the rest.
+    """
+    return rearrange(explored(loss_softmin(weights, losses.view_as(weights)), weights), "n k -> (n k)")
+
+
+def ranking_loss(weights: Float[Tensor, "n k"], losses: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
+    """Cross-entropy between w and the views' softmin of their losses; its gradient never vanishes on a wrong choice."""
+    return -(loss_softmin(weights, losses) * weights.clamp_min(1e-6).log()).sum(dim=-1)

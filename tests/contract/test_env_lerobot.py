@@ -26,11 +26,11 @@ class Command:
 
 
 def test_the_command_line_makes_a_configuration() -> None:
-    flags = ["--env.type=ur5", "--env.task=reach_target,pick_and_lift", "--env.cameras=[wrist, front]"]
+    flags = ["--env.type=ur5", "--env.task=reach_target,pick_and_lift", "--env.cameras=[front, wrist]"]
     config = draccus.parse(Command, args=[*flags, "--env.image_size=31"]).env
     assert isinstance(config, UR5EnvConfig)
     assert config.tasks == ["reach_target", "pick_and_lift"]
-    assert config.gym_kwargs["cameras"] == ("wrist", "front")
+    assert config.gym_kwargs["cameras"] == ("front", "wrist")
     again = draccus.decode(EnvConfig, draccus.encode(config, EnvConfig))
     assert again == config
 
@@ -42,6 +42,7 @@ def test_the_command_line_makes_a_configuration() -> None:
         ({"max_parallel_tasks": 2}, "histories"),
         ({"fps": 30}, "20 Hz"),
         ({"cameras": ["ceiling"]}, "ceiling"),
+        ({"cameras": ["wrist", "front"]}, "in this order"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, object], message: str) -> None:

@@ -259,10 +259,10 @@ def test_observing_between_ticks_changes_nothing(lifting: UR5Env) -> None:
     np.testing.assert_array_equal(*ends)
 
 
-def test_cameras_and_their_order_are_options() -> None:
-    env = tiny("reach_target", cameras=("wrist", "front"))
+def test_cameras_are_an_option() -> None:
+    env = tiny("reach_target", cameras=("front", "wrist"))
     observation, _ = env.reset(seed=0)
-    assert list(observation["pixels"]) == ["wrist", "front"]
+    assert list(observation["pixels"]) == ["front", "wrist"]
     assert len(observation["camera_intrinsics"]) == len(keys.intrinsics_names(env.cameras))
     assert env.observation_space.contains(observation)
     env.close()

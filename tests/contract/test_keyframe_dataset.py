@@ -20,7 +20,7 @@ from helpers.episodes import (
     write_picks,
     write_vector_picks,
 )
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, delete_episodes
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from dataset_tools import cli
@@ -118,6 +118,13 @@ def test_the_dataset_tells_how_it_was_made(keyed: LeRobotDataset) -> None:
 
 def test_paraphrases_come_along(keyed: LeRobotDataset) -> None:
     assert json.loads((keyed.root / keys.INSTRUCTIONS_FILE).read_text()) == {TASK: PARAPHRASES}
+
+
+def test_lerobots_editing_keeps_the_provenance(keyed: LeRobotDataset, tmp_path: Path) -> None:
+    rest = delete_episodes(keyed, [0], output_dir=tmp_path / "rest", repo_id="test/rest")
+    assert len(rest) == 3
+    assert {int(row[keys.SOURCE_EPISODE]) for row in rest} == {1}
+    assert torch.equal(rest[1][keys.depth_key("front")], keyed[4][keys.depth_key("front")])
 
 
 def test_chosen_episodes_keep_their_numbers_as_provenance(dense: Path, tmp_path: Path) -> None:

@@ -64,7 +64,6 @@ def test_every_backbone_gives_strides_2_to_16(config: TextureConfig) -> None:
     assert all(len(skip) == N * K for skip in skips)
 
 
-@pytest.mark.xfail(strict=True, reason="timm.list_models() names no tags; timm.is_model(name) knows them")
 def test_backbone_may_name_the_weights_it_starts_from() -> None:
     assert rgba(TextureConfig(backbone="resnet10t.c3_in1k", neck=4)).skip_channels
 

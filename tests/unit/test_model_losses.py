@@ -7,7 +7,15 @@ import torch
 
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
-from lerobot_histmv.model.losses import action_losses, heat_loss, quaternion_loss, term_weights, weighted_sum
+from lerobot_histmv.model.losses import (
+    PARAPHRASE_TEMPERATURE,
+    action_losses,
+    heat_loss,
+    paraphrase_loss,
+    quaternion_loss,
+    term_weights,
+    weighted_sum,
+)
 
 M, Y, X = 3, 5, 7
 
@@ -103,3 +111,21 @@ def test_loss_is_the_weighted_sum_of_its_terms() -> None:
     terms = action_losses(*prediction(), config) | {"mutual_information": torch.arange(M) + 1.0}
     weights = term_weights(config)
     torch.testing.assert_close(weighted_sum(terms, config), sum(weights[name] * term for name, term in terms.items()))
+
+
+def test_paraphrase_loss_of_orthogonal_meanings_in_closed_form() -> None:
+    """Five meanings of two equal sentences: one partner at cosine 1, eight others at cosine 0."""
+    meanings = torch.arange(5).repeat_interleave(2)
+    vectors = torch.nn.functional.one_hot(meanings, 7).float()
+    expected = math.log(1 + 8 * math.exp(-1 / PARAPHRASE_TEMPERATURE))
+    torch.testing.assert_close(paraphrase_loss(vectors, meanings), torch.tensor(expected))
+    confused = torch.ones_like(vectors) / 7**0.5
+    torch.testing.assert_close(paraphrase_loss(confused, meanings), torch.tensor(math.log(9)))
+
+
+def test_paraphrase_loss_without_partners_is_zero_with_finite_gradients() -> None:
+    vectors = unit(3, 0).requires_grad_()
+    loss = paraphrase_loss(vectors, torch.arange(3))
+    loss.backward()
+    assert loss.item() == 0
+    assert vectors.grad is not None and vectors.grad.isfinite().all()
