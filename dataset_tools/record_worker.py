@@ -94,7 +94,7 @@ class Demonstration:
                 self._env.execute(motion, self._on_tick)
         except ValueError:
             return "ik"
-        return "" if self._env.is_success() else self._env.stage.task.failure()
+        return "" if self._env.is_success() else self._env.failure()
 
     def _on_tick(self, tick: Any) -> None:
         if self._ticks % self._stride == 0:

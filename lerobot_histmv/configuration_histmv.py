@@ -1,6 +1,8 @@
 """Configuration of the HistMV policy as LeRobot's ``--policy.type=histmv`` knows it."""
 
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
@@ -85,6 +87,13 @@ class HistMVConfig(PreTrainedConfig):
         if self.cameras and self.cameras != cameras:
             raise ValueError(f"policy.cameras={self.cameras} differ from the dataset's calibrated cameras {cameras}")
         self.cameras = cameras
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Write ``config.json``. A checkpoint holds what was trained: loading it must not fetch what that began with."""
+        written, texture, semantics = copy(self), self.network.texture, self.network.semantics
+        own = replace(semantics, clip_pretrained=None if semantics.trained else semantics.clip_pretrained)
+        written.network = replace(self.network, texture=replace(texture, pretrained=False), semantics=own)
+        super(HistMVConfig, written)._save_pretrained(save_directory)
 
     def validate_features(self) -> None:
         """Raise ValueError unless every calibrated camera has a colour and a depth image of one size."""

@@ -115,7 +115,7 @@ class HistMVPolicy(PreTrainedPolicy):
             terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 
-        rows = row_weights(window.real, batch["frame_index"], config.network.history.past_steps)
+        rows = row_weights(window.real, config.network.history.past_steps)
         log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
         error = (predicted.position - target[step, :3]).norm(dim=-1)
         log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from einops import rearrange, repeat
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_histmv import keys
@@ -97,30 +97,29 @@ class Window:
 def choose_rows(exist: Bool[Tensor, "b t"]) -> tuple[Bool[Tensor, "b u"], Bool[Tensor, "b t"]]:
     """Windows of up to s + 1 rows, and the rows they pick from the 2s + 1 rows around each drawn row.
 
-    A window ends at the drawn row, or covers the first s + 1 rows of the episode if the drawn row is among them: all
-    steps of a short episode are learned together, instead of encoding its first rows again in each of many windows.
+    A window is the first s rows of the episode if the drawn row is among them, otherwise the drawn row and the s rows
+    before it. All steps of a short episode are so learned together, instead of encoding its first rows again in
+    each of many windows.
 
     Args:
         exist: which of the rows from s before to s after the drawn one lie in its episode.
     """
-    before = (~exist).cumprod(dim=1).sum(dim=1)
-    columns = before[:, None] + torch.arange((exist.shape[1] + 1) // 2, device=exist.device)
-    real = exist.gather(1, columns)
-    picked = torch.zeros_like(exist).scatter(1, columns, real)
+    before = (~exist).cumprod(dim=1).sum(dim=1, keepdim=True)
+    window = torch.arange((exist.shape[1] + 1) // 2, device=exist.device)
+    real = exist.gather(1, before + window) & ((before == 0) | (window < len(window) - 1))
+    picked = torch.zeros_like(exist).scatter(1, before + window, real)
     return real[:, real.any(dim=0)], picked  # a column that no window has would only cost attention
 
 
-def row_weights(
-    real: Bool[Tensor, "b u"], frame_index: Int[Tensor, " b"], past_steps: int
-) -> Float[Tensor, " n"]:
+def row_weights(real: Bool[Tensor, "b u"], past_steps: int) -> Float[Tensor, " n"]:
     """Share of each real row in its window's loss: only rows whose whole history the window shows.
 
-    All rows of a window that begins with its episode share evenly, of a later one the last row counts alone. Over an
+    The rows of an early window share evenly; of a later one, which alone has s + 1 rows, the last row counts. Over an
     epoch, which draws every row once, every row so gets a weight of 1.
     """
     count = real.sum(dim=1, keepdim=True)
     last = real.cumsum(dim=1) == count
-    return torch.where(frame_index[:, None] <= past_steps, 1 / count, last.float())[real]
+    return torch.where(count <= past_steps, 1 / count, last.float())[real]
 
 
 def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:

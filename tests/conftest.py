@@ -16,6 +16,7 @@ atexit.register(shutil.rmtree, SCRATCH, ignore_errors=True)
 os.environ |= {
     "HF_HUB_OFFLINE": "1",
     "HF_HOME": f"{SCRATCH}/huggingface",
+    "HISTMV_CACHE": f"{SCRATCH}/cache",
     "HF_LEROBOT_HOME": f"{SCRATCH}/lerobot",
     "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
     "MPLBACKEND": "agg",

@@ -70,10 +70,11 @@ def episode(steps: int, seed: int = 0, cameras: list[str] = CAMERAS) -> dict[str
 
 
 def window(rows: dict[str, torch.Tensor], end: int, past_steps: int = 2) -> dict[str, Any]:
-    """The window that ends at row ``end``; before the episode's start, its first row is repeated, marked as padding."""
-    wanted = torch.arange(end - past_steps, end + 1)
-    values = {key: rows[key][wanted.clamp_min(0)][None] for key in rows}
-    pads = {f"{key}_is_pad": (wanted < 0)[None] for key in rows}
+    """What the loader gives for the drawn row ``end``: 2s + 1 rows, marked as padding outside of the episode."""
+    wanted = torch.arange(end - past_steps, end + past_steps + 1)
+    last = len(rows[keys.STATE]) - 1
+    values = {key: rows[key][wanted.clamp(0, last)][None] for key in rows}
+    pads = {f"{key}_is_pad": ((wanted < 0) | (wanted > last))[None] for key in rows}
     return {**values, **pads, "task": [TASK]}
 
 

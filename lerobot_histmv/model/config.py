@@ -17,6 +17,7 @@ class TextureConfig:
         backbone: "plain" (four stride-2 stages) or the name of a timm model that supports ``features_only``.
         widths: channels of the plain backbone's stages, at strides 2, 4, 8 and 16.
         neck: channels of every PANet level.
+        language: let the instruction weight the channels of every level (the paper brings it in after fusion only).
         use_xyz: also feed each pixel's normalised world coordinates (the paper feeds RGB only).
         pretrained: load timm's weights (from its cache or the Hub).
     """
@@ -24,6 +25,7 @@ class TextureConfig:
     backbone: str = "plain"
     widths: tuple[int, ...] = (16, 32, 64, 64)
     neck: int = 24
+    language: bool = True
     use_xyz: bool = True
     pretrained: bool = False
 
@@ -134,7 +136,7 @@ class LossConfig:
 
     action: float = 1.0
     mutual_information: float = 0.01
-    heatmap: float = 0.1
+    heatmap: float = 0.5
     choice: float = 0.1
     paraphrase: float = 1.0
     gripper: str = "bce"

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_histmv.model.config import TextureConfig
-from lerobot_histmv.model.layers import ConvBlock, upsample_to
+from lerobot_histmv.model.layers import ConvBlock, Modulation, upsample_to
 
 STRIDE = 16
 """Pixels per cell of the fused feature map: 128 x 128 pixels give an 8 x 8 map."""
@@ -87,10 +87,11 @@ class RgbaFeatures(nn.Module):
     Args:
         config: texture part of the network's configuration.
         semantic_width: length of the global semantic vector.
+        text_width: length of the instruction vector.
         width: d, channels of FR.
     """
 
-    def __init__(self, config: TextureConfig, semantic_width: int, width: int) -> None:
+    def __init__(self, config: TextureConfig, semantic_width: int, text_width: int, width: int) -> None:
         super().__init__()
         self.use_xyz = config.use_xyz
         channels_in = 6 if config.use_xyz else 3
@@ -98,6 +99,9 @@ class RgbaFeatures(nn.Module):
             self.backbone: nn.Module = PlainBackbone(channels_in, config.widths)
         else:
             self.backbone = TimmBackbone(config.backbone, channels_in, config.pretrained)
+        self.listen = nn.ModuleList(
+            Modulation(channels, text_width) for channels in (self.backbone.channels if config.language else [])
+        )
         self.neck = PANet(self.backbone.channels[1:], config.neck)
         self.skip_channels = [self.backbone.channels[0], *[config.neck] * 3]
         self.semantic = nn.Linear(semantic_width, config.neck)
@@ -110,6 +114,7 @@ class RgbaFeatures(nn.Module):
         xyz: Float[Tensor, "n k 3 y x"],
         poses: Float[Tensor, "n k 1 y8 x8"],
         semantics: Float[Tensor, "n k c"],
+        text: Float[Tensor, "n e"],
     ) -> tuple[Float[Tensor, "n k d y16 x16"], list[Float[Tensor, "nk _ _ _"]]]:
         """FR of every view and the PANet levels (strides 2, 4, 8, 16) of all n * k images for the decoder's skips.
 
@@ -118,12 +123,13 @@ class RgbaFeatures(nn.Module):
             xyz: world coordinates scaled to about [-1, 1], 0 where depth is invalid.
             poses: thermal map of projected tool positions at stride 8.
             semantics: global vector of each view.
+            text: instruction vector.
         """
         k = rgb.shape[1]
         flat = rearrange(rgb, "n k c y x -> (n k) c y x") * 2 - 1
         if self.use_xyz:
             flat = torch.cat([flat, rearrange(xyz, "n k c y x -> (n k) c y x")], dim=1)
-        first, *rest = self.backbone(flat.contiguous(memory_format=torch.channels_last))
+        first, *rest = self._listened(self.backbone(flat.contiguous(memory_format=torch.channels_last)), text)
         levels = self.neck(rest)
         texture, coarse = levels[1], levels[2]
         expanded = self.semantic(rearrange(semantics, "n k c -> (n k) c"))
@@ -132,3 +138,12 @@ class RgbaFeatures(nn.Module):
         pooled = functional.avg_pool2d(self.fuse(joined), 2)
         features = self.refine(torch.cat([pooled, coarse], dim=1))
         return rearrange(features, "(n k) c y x -> n k c y x", k=k), [first, *levels]
+
+    def _listened(
+        self, levels: list[Float[Tensor, "nk _ _ _"]], text: Float[Tensor, "n e"]
+    ) -> list[Float[Tensor, "nk _ _ _"]]:
+        """Levels whose channels the instruction has weighted: which texture matters depends on what is asked for."""
+        if not len(self.listen):
+            return levels
+        each = text.repeat_interleave(len(levels[0]) // len(text), dim=0)
+        return [listen(level, each) for listen, level in zip(self.listen, levels, strict=True)]

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_histmv.model.config import HistoryConfig
+from lerobot_histmv.model.layers import Modulation
 
 
 class SelfAttentionBlock(nn.Module):
@@ -63,7 +64,7 @@ class History(nn.Module):
         super().__init__()
         self.skip_first = config.skip_first
         self.patch_in, self.patch_out = nn.Conv2d(width, width, 1), nn.Conv2d(width, width, 1)
-        self.gain, self.bias = nn.Linear(text_width, width), nn.Linear(text_width, width)
+        self.modulation = Modulation(width, text_width)
         self.step_code = nn.Embedding(config.past_steps + 1, width)
         self.patch_code = nn.Parameter(torch.randn(width, *grid) * 0.02)
         nn.init.normal_(self.step_code.weight, std=0.02)
@@ -95,8 +96,7 @@ class History(nn.Module):
         A convolution over a patch's channels joined by the sentence vector is a sum of one over the patch and one over
         the sentence; the gain beside that sum lets the sentence pick channels, which a sum alone learns slowly.
         """
-        b = len(fused)
-        text = functional.layer_norm(text, text.shape[-1:])
-        gain, bias = (repeat(part(text), "b d -> (b t) d 1 1", t=fused.shape[1]) for part in (self.gain, self.bias))
-        spoken = functional.gelu(self.patch_in(rearrange(fused, "b t d h w -> (b t) d h w")) * (1 + gain) + bias)
+        b, t = fused.shape[:2]
+        patches = self.patch_in(rearrange(fused, "b t d h w -> (b t) d h w"))
+        spoken = functional.gelu(self.modulation(patches, repeat(text, "b c -> (b t) c", t=t)))
         return fused + rearrange(self.patch_out(spoken), "(b t) d h w -> b t d h w", b=b) + self.patch_code

@@ -51,6 +51,22 @@ class CrossAttention(nn.Module):
         return queries + self.mix(queries)
 
 
+class Modulation(nn.Module):
+    """A sentence picks channels: gain and bias per channel from its vector (FiLM, Perez et al. 2018)."""
+
+    def __init__(self, channels: int, text_width: int) -> None:
+        super().__init__()
+        self.gain, self.bias = nn.Linear(text_width, channels), nn.Linear(text_width, channels)
+        for part in (self.gain, self.bias):
+            nn.init.normal_(part.weight, std=0.02)
+            nn.init.zeros_(part.bias)
+
+    def forward(self, maps: Float[Tensor, "n c y x"], text: Float[Tensor, "n e"]) -> Float[Tensor, "n c y x"]:
+        """Maps after gain and bias; the sentence vectors may have any scale."""
+        text = functional.layer_norm(text, text.shape[-1:])
+        return maps * (1 + self.gain(text)[:, :, None, None]) + self.bias(text)[:, :, None, None]
+
+
 def full_precision(like: Tensor) -> torch.autocast:
     """Context for geometry and information inside mixed precision: half precision would round metres to millimetres."""
     return torch.autocast(like.device.type, enabled=False)

@@ -82,7 +82,7 @@ class HistMVNet(nn.Module):
         self.workspace = Workspace(config.workspace)
         self.semantics = Semantics(config.semantics)
         text_width = self.semantics.text_width
-        self.rgba = RgbaFeatures(config.texture, self.semantics.image_width, config.width)
+        self.rgba = RgbaFeatures(config.texture, self.semantics.image_width, text_width, config.width)
         self.points = PointEncoder(config.points, self.workspace, config.width)
         self.transfuse = TransFuse(config.width, config.history.heads)
         self.view_attention = ViewAttention(config.views, config.width, text_width)
@@ -110,7 +110,7 @@ class HistMVNet(nn.Module):
             pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
             poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
 
-        features, skips = self.rgba(seen.rgb, scaled, poses, self.semantics.images(seen.rgb))
+        features, skips = self.rgba(seen.rgb, scaled, poses, self.semantics.images(seen.rgb), seen.text)
         points = self.points(cloud, seen.rgb, valid)
         maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))

@@ -40,7 +40,9 @@ def ball_query(
     count: int,
 ) -> Int[Tensor, "n c m"]:
     """Indices of the ``count`` nearest valid points within ``radius`` [m]; the nearest fills the missing places."""
-    distances = torch.cdist(centres, points).masked_fill(~valid[:, None], torch.inf)
+    # The faster product form of the distance cancels to centimetres of error for points far from the origin.
+    exact = torch.cdist(centres, points, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = exact.masked_fill(~valid[:, None], torch.inf)
     near, indices = distances.topk(min(count, points.shape[1]), dim=-1, largest=False)
     return torch.where(near <= radius, indices, indices[..., :1])
 

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from tiny_policy import CAMERAS, TASK, episode, observation, stack, tiny_config, tiny_policy
+from tiny_policy import window as window_of
 
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import canonical
@@ -41,8 +42,8 @@ def test_action_is_a_canonical_pose_in_the_workspace_and_a_gripper_command(
 
 def whole_window(policy: HistMVPolicy, rows: dict[str, torch.Tensor], steps: int) -> Any:
     """Predictions for every step of an episode that is encoded and decoded at once, as training does it."""
-    batch = {key: values[None, :steps] for key, values in rows.items()} | {"task": [TASK]}
-    window = read_window(batch, policy.config.cameras)
+    window = read_window(window_of(rows, steps - 1, LONG - 1), policy.config.cameras)
+    assert window.real.shape == (1, steps)
     seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
     with torch.no_grad():
         return policy.net(seen, window.real, "argmax")

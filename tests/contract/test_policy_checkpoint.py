@@ -21,7 +21,7 @@ from tiny_scene import tiny_network
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.model import semantics
-from lerobot_histmv.model.config import HistoryConfig, SemanticsConfig
+from lerobot_histmv.model.config import HistoryConfig, NetworkConfig, SemanticsConfig, TextureConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
 ROOT = Path(__file__).parents[2]
@@ -70,7 +70,22 @@ def test_checkpoint_states_the_order_of_cameras_and_holds_no_data_of_the_dataset
     assert stored["type"] == "histmv"
     with safe_open(folder / "model.safetensors", "pt") as weights:
         assert set(weights.keys()) == set(policy.state_dict())
-        assert not any("episode_ends" in name for name in weights.keys())  # noqa: SIM118
+
+
+def test_loading_a_checkpoint_fetches_no_weights_that_training_began_with(tmp_path: Path) -> None:
+    """The checkpoint holds them, trained; a frozen tower is not in it and must keep its source."""
+    began = NetworkConfig(
+        texture=TextureConfig(backbone="resnet10t", pretrained=True),
+        semantics=SemanticsConfig(clip_pretrained="somewhere.pt", train_clip=True),
+    )
+    config = tiny_config(network=began)
+    config._save_pretrained(tmp_path)
+    stored = PreTrainedConfig.from_pretrained(tmp_path).network
+    assert not stored.texture.pretrained
+    assert stored.semantics == SemanticsConfig(train_clip=True)
+    assert config.network is began, "the running configuration still says what it began with"
+    tiny_config(network=replace(began, semantics=SemanticsConfig(clip_pretrained="kept.pt")))._save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path).network.semantics.clip_pretrained == "kept.pt"
 
 
 def test_training_continues_from_a_loaded_policy(saved: tuple[HistMVPolicy, Path]) -> None:
@@ -181,7 +196,7 @@ def test_instructions_survive_with_their_paraphrases(tmp_path: Path) -> None:
 
 def test_fine_tuning_on_another_dataset_adds_its_instructions(saved: tuple[HistMVPolicy, Path], tmp_path: Path) -> None:
     _, folder = saved
-    tasks, episodes = SimpleNamespace(index=["press the green button"]), {"dataset_to_index": [1]}
-    other = SimpleNamespace(root=tmp_path, tasks=tasks, episodes=episodes)
+    tasks = SimpleNamespace(index=["press the green button"])
+    other = SimpleNamespace(root=tmp_path, tasks=tasks)
     loaded = HistMVPolicy.from_pretrained(folder, dataset_meta=other)
     assert {TASK, "press the green button"} <= set(loaded.config.instructions)

@@ -16,6 +16,7 @@ from tiny_scene import SIZE, tiny_network
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
+from lerobot_histmv.windows import choose_rows, row_weights
 
 REPO, LENGTHS, PAST_STEPS = "local/tiny", (1, 3, 5), 2
 
@@ -89,18 +90,20 @@ def test_policy_reads_cameras_sizes_and_paraphrases_from_the_dataset(policy: His
     assert policy.config.instructions == {TASK: [TASK, "lift the red cube"]}
 
 
-def test_windows_have_the_configured_length_and_every_row_a_target(batch: dict[str, Any]) -> None:
-    assert batch[keys.STATE].shape == (sum(LENGTHS), PAST_STEPS + 1, STATE_SIZE)
-    assert batch[keys.ACTION].shape == (sum(LENGTHS), PAST_STEPS + 1, 8)
+def test_rows_come_with_their_neighbours_and_every_row_with_a_target(batch: dict[str, Any]) -> None:
+    assert batch[keys.STATE].shape == (sum(LENGTHS), 2 * PAST_STEPS + 1, STATE_SIZE)
+    assert batch[keys.ACTION].shape == (sum(LENGTHS), 2 * PAST_STEPS + 1, 8)
     padded = batch[f"{keys.STATE}_is_pad"]
     assert padded.equal(batch[f"{keys.ACTION}_is_pad"])
-    assert padded.sum(dim=1).tolist() == [max(0, PAST_STEPS - step) for length in LENGTHS for step in range(length)]
+    around = range(-PAST_STEPS, PAST_STEPS + 1)
+    outside = [[not 0 <= step + d < length for d in around] for length in LENGTHS for step in range(length)]
+    assert padded.tolist() == outside
 
 
-def test_every_row_of_the_dataset_counts_once(policy: HistMVPolicy, batch: dict[str, Any]) -> None:
-    real = ~batch[f"{keys.STATE}_is_pad"]
-    rows = (batch["index"][:, None] + torch.arange(-PAST_STEPS, 1))[real]
-    total = torch.zeros(sum(LENGTHS)).index_add(0, rows, policy._row_weights(batch, real))
+def test_every_row_of_the_dataset_counts_once(batch: dict[str, Any]) -> None:
+    real, picked = choose_rows(~batch[f"{keys.STATE}_is_pad"])
+    rows = (batch["index"][:, None] + torch.arange(-PAST_STEPS, PAST_STEPS + 1))[picked]
+    total = torch.zeros(sum(LENGTHS)).index_add(0, rows, row_weights(real, PAST_STEPS))
     torch.testing.assert_close(total, torch.ones(sum(LENGTHS)))
 
 

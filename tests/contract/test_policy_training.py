@@ -17,9 +17,8 @@ from lerobot_histmv.model.losses import term_weights
 
 
 def training_batch() -> dict[str, Any]:
-    """Windows with 0, 1 and 2 padding rows."""
-    rows = episode(5)
-    return stack([window(rows, end) for end in (4, 1, 0)])
+    """A late window, a whole one and one of an episode of a single row."""
+    return stack([window(episode(5), 4), window(episode(5), 1), window(episode(1), 0)])
 
 
 @pytest.mark.parametrize("choice", ["ranked", "expected", "argmax", "sampled"])
@@ -43,7 +42,7 @@ def test_log_names_every_term_view_and_the_error_in_millimetres(training: bool) 
     loss, log = policy(training_batch())
     weights = term_weights(policy.config.loss)
     if not training:
-        del weights["choice"]
+        del weights["choice"], weights["paraphrase"]
     assert set(log) == {*weights, "position_mm", *(f"view_{camera}" for camera in CAMERAS)}
     assert math.isclose(sum(weights[name] * log[name] for name in weights), loss.item(), rel_tol=1e-5)
     assert math.isclose(sum(log[f"view_{camera}"] for camera in CAMERAS), 1, rel_tol=1e-5)
@@ -119,36 +118,26 @@ def test_episodes_of_one_row_train() -> None:
     assert loss.isfinite()
 
 
-def dataset_meta(lengths: list[int], root: Path) -> Any:
+def dataset_meta(root: Path) -> Any:
     """The part of LeRobot's metadata that the policy reads."""
-    ends = torch.tensor(lengths).cumsum(dim=0).tolist()
-    return SimpleNamespace(root=root, tasks=SimpleNamespace(index=[TASK]), episodes={"dataset_to_index": ends})
+    return SimpleNamespace(root=root, tasks=SimpleNamespace(index=[TASK]))
 
 
-@pytest.mark.parametrize("past_steps", [1, 2, 5])
-def test_every_row_of_a_dataset_counts_once(past_steps: int, tmp_path: Path) -> None:
-    """LeRobot draws every row as the end of a window, so a row lies in up to s + 1 windows."""
-    lengths = [1, 2, 3, 7]
-    policy = tiny_policy(tiny_config(past_steps=past_steps), dataset_meta=dataset_meta(lengths, tmp_path))
-    total = torch.zeros(sum(lengths))
-    for number, length in enumerate(lengths):
-        start = sum(lengths[:number])
-        wanted = torch.arange(length)[:, None] + torch.arange(-past_steps, 1)
-        step = torch.arange(length)
-        batch = {"index": start + step, "frame_index": step, "episode_index": torch.full((length,), number)}
-        weights = policy._row_weights(batch, wanted >= 0)
-        total.index_add_(0, start + wanted[wanted >= 0], weights)
-    torch.testing.assert_close(total, torch.ones(sum(lengths)))
+def test_loss_of_an_episode_that_fits_into_a_window_does_not_depend_on_the_drawn_row() -> None:
+    policy, rows = tiny_policy(tiny_config(past_steps=3)), episode(3)
+    expected, _ = policy(window(rows, 2, past_steps=3))
+    for drawn in (0, 1):
+        torch.testing.assert_close(policy(window(rows, drawn, past_steps=3))[0], expected)
 
 
-def test_row_weights_enter_the_loss(tmp_path: Path) -> None:
-    """Over all windows of a short episode, the weighted loss is the plain mean over its rows."""
-    rows = episode(3)
-    batch = stack([window(rows, end) for end in range(3)])
-    batch |= {"index": torch.arange(3), "frame_index": torch.arange(3), "episode_index": torch.zeros(3).long()}
-    counted, _ = tiny_policy(dataset_meta=dataset_meta([3], tmp_path))(batch)
-    once, _ = tiny_policy()(window(rows, 2))
-    torch.testing.assert_close(counted, once)
+def test_late_windows_teach_their_last_row_only() -> None:
+    """Later rows of the episode, and targets of rows whose history the window cuts off, change nothing."""
+    policy, rows, other = tiny_policy(), episode(7), episode(7)
+    expected, _ = policy(window(rows, 4))
+    other[keys.ACTION][[2, 3, 5, 6]] += 0.1
+    torch.testing.assert_close(policy(window(other, 4))[0], expected)
+    other[keys.ACTION][4] += 0.1
+    assert policy(window(other, 4))[0] != expected
 
 
 def test_training_draws_among_paraphrases_and_evaluation_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,13 +158,13 @@ def test_paraphrases_come_from_the_dataset(tmp_path: Path) -> None:
     path.parent.mkdir()
     path.write_text('{"pick up the red cube": ["lift the red cube"]}')
     config = tiny_config(instructions={})
-    tiny_policy(config, dataset_meta=dataset_meta([1], tmp_path))
+    tiny_policy(config, dataset_meta=dataset_meta(tmp_path))
     assert config.instructions == {TASK: [TASK, "lift the red cube"]}
 
 
 def test_paraphrases_of_the_configuration_survive_a_dataset_without_any(tmp_path: Path) -> None:
     config = tiny_config(instructions={TASK: [TASK, "lift the red cube"]})
-    tiny_policy(config, dataset_meta=dataset_meta([1], tmp_path))
+    tiny_policy(config, dataset_meta=dataset_meta(tmp_path))
     assert config.instructions == {TASK: [TASK, "lift the red cube"]}
 
 

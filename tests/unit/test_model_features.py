@@ -8,7 +8,7 @@ from lerobot_histmv.model.config import TextureConfig
 from lerobot_histmv.model.features import POSE_STRIDE, STRIDE, PANet, RgbaFeatures
 from lerobot_histmv.model.layers import ConvBlock, masked_mean, upsample_to
 
-N, K, WIDTH, SEMANTIC = 2, 3, 8, 5
+N, K, WIDTH, SEMANTIC, TEXT = 2, 3, 8, 5, 7
 TINY = TextureConfig(widths=(4, 4, 8, 8), neck=4)
 
 
@@ -36,12 +36,13 @@ def images(k: int = K) -> dict[str, torch.Tensor]:
         "xyz": torch.rand(N, k, 3, *SIZE, generator=generator) * 2 - 1,
         "poses": torch.rand(N, k, 1, SIZE[0] // POSE_STRIDE, SIZE[1] // POSE_STRIDE, generator=generator),
         "semantics": torch.randn(N, k, SEMANTIC, generator=generator),
+        "text": torch.randn(N, TEXT, generator=generator),
     }
 
 
 def rgba(config: TextureConfig = TINY) -> RgbaFeatures:
     torch.manual_seed(0)
-    return RgbaFeatures(config, SEMANTIC, WIDTH).eval()
+    return RgbaFeatures(config, SEMANTIC, TEXT, WIDTH).eval()
 
 
 @pytest.mark.parametrize(
@@ -75,10 +76,17 @@ def test_unfit_backbones_are_refused_by_name(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("use_xyz", "influential"), [(True, {"rgb", "xyz", "poses", "semantics"}), (False, {"rgb", "poses", "semantics"})]
+    ("switches", "influential"),
+    [
+        ({}, {"rgb", "xyz", "poses", "semantics", "text"}),
+        ({"use_xyz": False}, {"rgb", "poses", "semantics", "text"}),
+        ({"language": False}, {"rgb", "xyz", "poses", "semantics"}),
+    ],
 )
-def test_every_input_that_the_configuration_names_influences_the_features(use_xyz: bool, influential: set[str]) -> None:
-    module = rgba(TextureConfig(widths=TINY.widths, neck=TINY.neck, use_xyz=use_xyz))
+def test_every_input_that_the_configuration_names_influences_the_features(
+    switches: dict[str, bool], influential: set[str]
+) -> None:
+    module = rgba(TextureConfig(widths=TINY.widths, neck=TINY.neck, **switches))
     leaves = {name: values.requires_grad_() for name, values in images().items()}
     features, _ = module(**leaves)
     features.square().sum().backward()
@@ -88,7 +96,9 @@ def test_every_input_that_the_configuration_names_influences_the_features(use_xy
 def test_views_are_encoded_alone_by_the_same_weights() -> None:
     module, order = rgba(), torch.tensor([2, 0, 1])
     features, skips = module(**images())
-    permuted, permuted_skips = module(**{name: values[:, order] for name, values in images().items()})
+    inputs = images()
+    views = {name: values[:, order] for name, values in inputs.items() if name != "text"}
+    permuted, permuted_skips = module(**views, text=inputs["text"])
     torch.testing.assert_close(permuted, features[:, order])
     for skip, other in zip(skips, permuted_skips, strict=True):
         torch.testing.assert_close(other.unflatten(0, (N, K)), skip.unflatten(0, (N, K))[:, order])

@@ -46,6 +46,13 @@ def test_heat_loss_of_a_uniform_map_is_the_logarithm_of_its_pixels() -> None:
     torch.testing.assert_close(heat_loss(*heat_case()), torch.full((M,), math.log(Y * X)))
 
 
+def test_heat_loss_of_a_key_pose_above_the_surface_wants_the_pixels_below_it() -> None:
+    uniform, cloud, target = heat_case()
+    heights = torch.tensor([0.03, 0.07, 0.13])[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
+    torch.testing.assert_close(heat_loss(log_heat, cloud, target + heights), heat_loss(log_heat, cloud, target))
+
+
 def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
     _, cloud, target = heat_case()
     centimetres = 100 * (cloud - target[:, :, None, None]).norm(dim=1)
@@ -100,7 +107,9 @@ def test_gripper_loss_in_both_forms(form: str) -> None:
 def test_every_term_has_a_weight_of_its_name(heatmap: float) -> None:
     config = LossConfig(action=3.0, mutual_information=0.2, heatmap=heatmap, choice=0.7)
     terms, weights = action_losses(*prediction(), config), term_weights(config)
-    assert {*terms, "mutual_information", "choice"} == {*weights} - ({"heatmap"} if heatmap == 0 else set())
+    assert {*terms, "mutual_information", "choice", "paraphrase"} == {*weights} - (
+        {"heatmap"} if heatmap == 0 else set()
+    )
     assert ("heatmap" in terms) == (heatmap > 0)
     assert [weights[name] for name in ("position", "rotation", "gripper")] == [3.0] * 3
     assert (weights["mutual_information"], weights["heatmap"], weights["choice"]) == (0.2, heatmap, 0.7)

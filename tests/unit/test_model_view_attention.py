@@ -5,6 +5,7 @@ import torch
 
 from lerobot_histmv.model.config import ViewConfig
 from lerobot_histmv.model.view_attention import (
+    best_shares,
     EXPLORE,
     ViewAttention,
     choice_loss,
@@ -103,7 +104,7 @@ def test_sampling_draws_each_view_about_as_often_as_its_weight_and_absent_ones_n
     for weights in WEIGHTS:
         pairs, shares = choose_views(weights.expand(4001, 3), "sampled")
         frequency = torch.bincount(pairs[:, 1], minlength=3) / len(pairs)
-        torch.testing.assert_close(frequency, explored(weights[None])[0], atol=0.03, rtol=0)
+        torch.testing.assert_close(frequency, explored(weights[None], weights[None])[0], atol=0.03, rtol=0)
         torch.testing.assert_close(frequency, weights, atol=EXPLORE, rtol=0)
         assert frequency[weights == 0].eq(0).all()
         assert shares.eq(1).all()
@@ -140,6 +141,17 @@ def test_all_views_are_decoded_and_share_one_unit_among_the_present(choice: str)
     assert (per_step[WEIGHTS > 0] > 0).all()
     if choice == "ranked":
         torch.testing.assert_close(per_step, torch.tensor([[1 / 3] * 3, [0.5, 0.0, 0.5]]))
+
+
+def test_best_views_get_most_of_the_training_and_no_present_view_starves() -> None:
+    losses = torch.tensor([[1.0, 0.1, 2.0], [1.0, 0.0, 0.1]], requires_grad=True)
+    shares = best_shares(WEIGHTS, losses.flatten()).view(2, 3)
+    torch.testing.assert_close(shares.sum(dim=1), torch.ones(2))
+    assert shares.argmax(dim=1).tolist() == [1, 2]
+    assert shares[1, 1] == 0, "an absent view takes no part"
+    assert (shares[WEIGHTS > 0] > EXPLORE / 3 - 1e-6).all()
+    assert not shares.requires_grad
+    torch.testing.assert_close(best_shares(WEIGHTS, 100 * losses.flatten()).view(2, 3), shares, rtol=1e-3, atol=0)
 
 
 def test_expected_loss_takes_weight_from_views_that_decode_worse() -> None:

@@ -10,15 +10,18 @@ from tiny_scene import SIZE, cameras_around, noise_images
 from lerobot_histmv import keys
 from lerobot_histmv.model.augment import AugmentConfig, random_world_motion
 from lerobot_histmv.model.cameras import project
-from lerobot_histmv.windows import Window, causal_heat, read_window
+from lerobot_histmv.windows import Window, causal_heat, choose_rows, read_window, row_weights
 
-B, T, CAMERAS = 3, 5, ["front", "wrist"]
-K = len(CAMERAS)
-PADS = (0, 2, 4)
+B, T, CAMERAS = 3, 9, ["front", "wrist"]
+K, S = len(CAMERAS), 4
+EPISODES = ((0, 7), (2, 7), (4, 5))
+"""Which of the nine rows around each drawn row, the fifth, lie in its episode."""
+WINDOWS = ((0, 5), (2, 6), (4, 5))
+"""Rows of each window: up to the drawn one, the first four of the episode, and an episode of one row."""
 
 
 def window_batch() -> dict[str, Any]:
-    """Three windows of five steps, of which the first 0, 2 and 4 are padding."""
+    """Nine rows around each of three drawn rows."""
     generator = torch.Generator().manual_seed(0)
     rgb, depth = (v.unflatten(0, (B, T)) for v in noise_images(B * T, K, generator))
     intrinsics, extrinsics = (v.flatten().repeat(B, T, 1) for v in cameras_around(K))
@@ -29,7 +32,7 @@ def window_batch() -> dict[str, Any]:
         keys.ACTION: pose[1],
         keys.INTRINSICS: intrinsics,
         keys.EXTRINSICS: extrinsics,
-        f"{keys.STATE}_is_pad": torch.tensor([[i < pads for i in range(T)] for pads in PADS]),
+        f"{keys.STATE}_is_pad": torch.tensor([[not a <= i < b for i in range(T)] for a, b in EPISODES]),
     }
     for k, camera in enumerate(CAMERAS):
         batch |= {keys.rgb_key(camera): rgb[:, :, k], keys.depth_key(camera): 1000 * depth[:, :, k, None]}
@@ -39,16 +42,31 @@ def window_batch() -> dict[str, Any]:
 def test_only_real_rows_are_kept_in_order() -> None:
     batch = window_batch()
     window = read_window(batch, CAMERAS)
-    real = ~batch[f"{keys.STATE}_is_pad"]
-    assert window.real.equal(real)
-    rows = [(b, t) for b in range(B) for t in range(PADS[b], T)]
-    assert len(window.tool) == len(rows) == real.sum()
+    assert window.real.tolist() == [[i < last - first for i in range(S + 1)] for first, last in WINDOWS]
+    rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
+    assert len(window.tool) == len(rows) == window.real.sum()
     for n, (b, t) in enumerate(rows):
         assert window.tool[n].equal(batch[keys.STATE][b, t, :3])
         assert window.action[n].equal(batch[keys.ACTION][b, t])
         for k, camera in enumerate(CAMERAS):
             assert window.rgb[n, k].equal(batch[keys.rgb_key(camera)][b, t])
             torch.testing.assert_close(window.depth[n, k], batch[keys.depth_key(camera)][b, t, 0] / 1000)
+
+
+@pytest.mark.parametrize("past_steps", [0, 1, 2, 5])
+@pytest.mark.parametrize("length", [1, 2, 3, 7])
+def test_every_row_of_an_episode_counts_once(past_steps: int, length: int) -> None:
+    """Each row is drawn once per epoch; the windows' losses weigh alike, so the shares of a row must add up to 1."""
+    drawn, around = torch.arange(length), torch.arange(-past_steps, past_steps + 1)
+    rows = drawn[:, None] + around
+    real, picked = choose_rows((rows >= 0) & (rows < length))
+    weights = row_weights(real, past_steps)
+    torch.testing.assert_close(torch.zeros(length).index_add(0, rows[picked], weights), torch.ones(length))
+    owner = real.nonzero()[:, 0]
+    torch.testing.assert_close(torch.zeros(length).index_add(0, owner, weights), torch.ones(length))
+    starts = torch.tensor([rows[n][picked[n]].min() for n in range(length)])
+    whole = (starts == 0)[owner] | (rows[picked] == drawn[owner])
+    assert (weights[~whole] == 0).all(), "a row without its whole history teaches nothing"
 
 
 def test_padding_rows_have_no_influence_on_the_window() -> None:
@@ -71,7 +89,7 @@ def test_calibration_is_unpacked_camera_by_camera() -> None:
 
 
 def test_single_observations_are_windows_of_one_step() -> None:
-    batch = {key: values[:, -1] for key, values in window_batch().items() if not key.endswith("_is_pad")}
+    batch = {key: values[:, S] for key, values in window_batch().items() if not key.endswith("_is_pad")}
     batch.pop(keys.ACTION)
     window = read_window(batch, CAMERAS)
     assert window.real.shape == (B, 1)
@@ -105,10 +123,10 @@ def test_each_row_sees_the_tool_now_and_before_and_never_the_future() -> None:
     batch = window_batch()
     window = read_window(batch, CAMERAS)
     seen = window.observe(torch.zeros(B, 2))
-    rows = [(b, t) for b in range(B) for t in range(PADS[b], T)]
+    rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
     for n, (b, t) in enumerate(rows):
-        drawn = {tuple(seen.tool[n, p].tolist()): seen.heat[n, p].item() for p in range(T) if seen.heat[n, p] > 0}
-        ages = {tuple(batch[keys.STATE][b, past, :3].tolist()): t - past for past in range(PADS[b], t + 1)}
+        drawn = {tuple(seen.tool[n, p].tolist()): seen.heat[n, p].item() for p in range(S + 1) if seen.heat[n, p] > 0}
+        ages = {tuple(batch[keys.STATE][b, past, :3].tolist()): t - past for past in range(WINDOWS[b][0], t + 1)}
         assert set(drawn) == set(ages), "real steps up to now, and no other"
         torch.testing.assert_close(
             torch.tensor([drawn[tool] for tool in ages]),
@@ -121,7 +139,7 @@ def test_each_row_sees_the_tool_now_and_before_and_never_the_future() -> None:
 def test_each_row_gets_the_instruction_of_its_window() -> None:
     text = torch.arange(B, dtype=torch.float32)[:, None]
     seen = read_window(window_batch(), CAMERAS).observe(text)
-    assert seen.text[:, 0].tolist() == [0] * 5 + [1] * 3 + [2]
+    assert seen.text[:, 0].tolist() == [0] * 5 + [1] * 4 + [2]
 
 
 def moved_window() -> tuple[Window, Window, torch.Tensor]:

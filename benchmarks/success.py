@@ -1,0 +1,107 @@
+"""Success of the default preset on unseen scenes: record, keyframe, train with ``lerobot-train``, evaluate.
+
+    python benchmarks/success.py --setting=pick_and_lift --seed=0 [--output=outputs/success] [--threads=2]
+
+Each setting's demonstrations are recorded once and shared by its seeds. Killed and started again, it continues. The
+commands, the training time and the evaluation's figures go to ``benchmarks/results/success.json``.
+"""
+
+import argparse
+import fcntl
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dataset_tools import config_files
+from dataset_tools.demo import last_checkpoint, resume_training
+from dataset_tools.eval_settings import REPORTED_SEEDS
+from dataset_tools.stages import Stage, read_state, run_stages
+
+RESULTS = Path(__file__).parent / "results" / "success.json"
+SETTINGS: dict[str, tuple[str, int, int | None]] = {
+    "reach_target": ("reach_target", 50, None),
+    "pick_and_lift": ("pick_and_lift", 50, None),
+    "push_buttons_fixed": ("push_buttons", 50, 6),
+    "push_buttons": ("push_buttons", 100, None),
+}
+"""Task, demonstrations, and the variation if it is fixed: red, then green."""
+SCENES = 100
+
+
+def data_stages(setting: str, folder: Path) -> list[Stage]:
+    """Record and keyframe; the seeds share what they make."""
+    task, episodes, variation = SETTINGS[setting]
+    fixed = () if variation is None else (f"--env.variation={variation}",)
+    record = (
+        "histmv", "record", f"--env.task={task}", *fixed, f"--episodes={episodes}", "--seed=0",
+        f"--repo_id=local/{setting}", f"--root={folder / 'episodes'}",
+    )  # fmt: skip
+    keyframe = (
+        "histmv", "keyframe", f"--dataset.repo_id=local/{setting}", f"--dataset.root={folder / 'episodes'}",
+        f"--output.repo_id=local/{setting}_keyframes", f"--output.root={folder / 'keyframes'}",
+    )  # fmt: skip
+    return [Stage("record", f"record {setting}", record), Stage("keyframe", "find keyframes", keyframe)]
+
+
+def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
+    """Train with one seed, then evaluate the final checkpoint."""
+    task, _, variation = SETTINGS[setting]
+    fixed = () if variation is None else (f"--env.variation={variation}",)
+    training = folder / f"seed_{seed}" / "train"
+    train = (
+        "lerobot-train", f"--config_path={config_files.find('train/default')}", "--policy.device=cpu",
+        f"--dataset.repo_id=local/{setting}_keyframes", f"--dataset.root={folder / 'keyframes'}",
+        f"--output_dir={training}", f"--seed={seed}",
+    )  # fmt: skip
+    evaluate = (
+        "histmv", "eval", f"--policy.path={last_checkpoint(training)}", "--env.type=ur5", f"--env.task={task}", *fixed,
+        f"--eval.n_episodes={SCENES}", f"--seed={REPORTED_SEEDS}", "--videos=0",
+        f"--output_dir={folder / f'seed_{seed}' / 'evaluation'}",
+    )  # fmt: skip
+    return [
+        Stage("train", f"train {setting}, seed {seed}", train, resume=resume_training(train, training)),
+        Stage("evaluate", f"evaluate on {SCENES} scenes", evaluate),
+    ]
+
+
+def add_result(name: str, result: dict[str, Any]) -> None:
+    """Put one result among the others; several benchmarks may do so at once."""
+    RESULTS.parent.mkdir(exist_ok=True)
+    with (RESULTS.parent / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+        RESULTS.write_text(json.dumps(dict(sorted((known | {name: result}).items())), indent=2) + "\n")
+
+
+def main() -> None:
+    """Run one setting with one training seed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--setting", choices=SETTINGS, default="pick_and_lift")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("outputs/success"))
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    args = parser.parse_args()
+    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
+    folder = args.output / args.setting
+    run_stages(data_stages(args.setting, folder), folder, Console(), environment)
+    own = folder / f"seed_{args.seed}"
+    run_stages(learning_stages(args.setting, args.seed, folder), own, Console(), environment)
+    state = read_state(own)
+    (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
+    add_result(
+        f"{args.setting}, seed {args.seed}",
+        {
+            "demonstrations": SETTINGS[args.setting][1],
+            "threads": args.threads,
+            "training_minutes": round(state["train"].seconds / 60, 1),
+            **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95", "failures", "decision_ms")},
+            "commands": [" ".join(record.command) for record in state.values()],
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()
