@@ -89,7 +89,7 @@ class HistMVConfig(PreTrainedConfig):
         self.cameras = cameras
 
     def _save_pretrained(self, save_directory: Path) -> None:
-        """Write ``config.json``. A checkpoint holds what was trained: loading it must not fetch what that began with."""
+        """Write ``config.json``. A checkpoint holds trained weights: loading it must not fetch what they began with."""
         written, texture, semantics = copy(self), self.network.texture, self.network.semantics
         own = replace(semantics, clip_pretrained=None if semantics.trained else semantics.clip_pretrained)
         written.network = replace(self.network, texture=replace(texture, pretrained=False), semantics=own)

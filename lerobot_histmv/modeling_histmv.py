@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from einops import rearrange, repeat
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 

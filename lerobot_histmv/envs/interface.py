@@ -45,8 +45,8 @@ def check_options(
             raise ValueError(f"{name} is {value!r}; accepted are {', '.join(accepted)}")
     if not cameras or list(cameras) != [camera for camera in CAMERA_NAMES if camera in cameras]:
         raise ValueError(
-            f"cameras are {list(cameras)}; they must be different names out of {', '.join(CAMERA_NAMES)}, in this order: "
-            "calibration is a plain vector, and another order would give every view another's camera"
+            f"cameras are {list(cameras)}; they must be different names out of {', '.join(CAMERA_NAMES)}, "
+            "in this order: calibration is a plain vector, and another order would give every view another's camera"
         )
     low, high = IMAGE_SIZES
     for name, size in (("image_size", image_size), ("render_size", render_size)):

@@ -47,7 +47,7 @@ def test_heat_loss_of_a_uniform_map_is_the_logarithm_of_its_pixels() -> None:
 
 
 def test_heat_loss_of_a_key_pose_above_the_surface_wants_the_pixels_below_it() -> None:
-    uniform, cloud, target = heat_case()
+    _, cloud, target = heat_case()
     heights = torch.tensor([0.03, 0.07, 0.13])[:, None] * torch.tensor([0.0, 0.0, 1.0])
     log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
     torch.testing.assert_close(heat_loss(log_heat, cloud, target + heights), heat_loss(log_heat, cloud, target))

@@ -5,9 +5,9 @@ import torch
 
 from lerobot_histmv.model.config import ViewConfig
 from lerobot_histmv.model.view_attention import (
-    best_shares,
     EXPLORE,
     ViewAttention,
+    best_shares,
     choice_loss,
     choose_views,
     explored,
