@@ -5,12 +5,10 @@ is dropped when the evaluation is taken up again.
 """
 
 import dataclasses
-import fcntl
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -99,23 +97,6 @@ def read_episodes(path: Path) -> list[Episode]:
         except (json.JSONDecodeError, TypeError) as error:
             raise ValueError(f"line {number} of {path} is no finished episode ({error}); remove it to go on") from error
     return episodes
-
-
-@contextmanager
-def exclusive(directory: Path) -> Iterator[None]:
-    """Hold ``directory`` for one process; the lock ends with the process, however it ends.
-
-    Raises:
-        ValueError: another process holds it.
-    """
-    with (directory / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"another evaluation is writing to {directory}; wait for it or choose --output_dir"
-            ) from None
-        yield
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:

@@ -21,9 +21,10 @@ from rich.console import Console
 
 from dataset_tools.eval_checkpoint import Pilot, check_fits, fingerprint, load_config
 from dataset_tools.eval_report import circumstances, progress_bar, results_table, success_rate
-from dataset_tools.eval_results import Episode, EpisodeLog, evaluation_info, exclusive
+from dataset_tools.eval_results import Episode, EpisodeLog, evaluation_info
 from dataset_tools.eval_rollout import Rollout, Scenes
 from dataset_tools.eval_settings import EvaluateConfig
+from dataset_tools.locks import only_one
 from dataset_tools.shards import write_json
 from dataset_tools.video import TEMPORARY
 
@@ -163,7 +164,8 @@ def run(config: EvaluateConfig) -> None:
     console = Console()
     evaluation = Evaluation(config)
     evaluation.output.mkdir(parents=True, exist_ok=True)
-    with exclusive(evaluation.output):
+    refusal = f"another evaluation is writing to {evaluation.output}; wait for it or choose --output_dir"
+    with only_one(evaluation.output, refusal):
         evaluation.claim()
         log = EpisodeLog(evaluation.output / EPISODES_FILE)
         results = {}

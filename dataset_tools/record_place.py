@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
+from dataset_tools.locks import only_one
 from dataset_tools.record_settings import RecordSettings
 from dataset_tools.shards import write_json
 
@@ -65,16 +64,9 @@ class RecordPlace:
         """
         self.parts.mkdir(parents=True, exist_ok=True)
         self._refuse_foreign()
-        lock = FileLock(self.parts / _LOCK)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout as error:
-            raise ValueError(f"{self.root} is being recorded by another process") from error
-        try:
+        with only_one(self.parts, f"{self.root} is being recorded by another process", _LOCK):
             self._take_over()
             yield self.parts
-        finally:
-            lock.release()
 
     def _refuse_foreign(self) -> None:
         names = {path.name for path in self.parts.iterdir() if path.suffix != ".tmp"}

@@ -1,10 +1,8 @@
 """A list of commands, run one after another: calm progress, a log each, and a state file from which it continues."""
 
-import fcntl
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -12,9 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dataset_tools import child_process
+from dataset_tools.locks import only_one
 
 STATE_FILE = "stages.json"
-LOCK_FILE = ".lock"
 LOG_FOLDER = "logs"
 TAIL = 15
 
@@ -78,21 +76,6 @@ def check_commands(stages: Sequence[Stage], state: Mapping[str, Record], folder:
             )
 
 
-@contextmanager
-def only_one(folder: Path) -> Iterator[None]:
-    """Hold ``folder`` for this process.
-
-    Raises:
-        ValueError: another process works in it.
-    """
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"another run is at work in {folder}") from error
-        yield
-
-
 def run_stages(stages: Sequence[Stage], folder: Path, console: Console, environment: Mapping[str, str]) -> None:
     """Run every stage that ``folder`` does not already hold.
 
@@ -101,7 +84,7 @@ def run_stages(stages: Sequence[Stage], folder: Path, console: Console, environm
         StageFailedError: a command failed; the message ends with the last lines of its log.
     """
     (folder / LOG_FOLDER).mkdir(parents=True, exist_ok=True)
-    with only_one(folder):
+    with only_one(folder, f"another run is at work in {folder}"):
         state = read_state(folder)
         check_commands(stages, state, folder)
         for number, stage in enumerate(stages, 1):

@@ -1,8 +1,6 @@
 """Results survive kills, intervals are Wilson's, and the summary keeps LeRobot's names."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,6 @@ from dataset_tools.eval_results import (
     Episode,
     EpisodeLog,
     evaluation_info,
-    exclusive,
     read_episodes,
     wilson_interval,
 )
@@ -89,20 +86,6 @@ def test_damaged_line_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes() + b'{"task": "lift"}\n')
     with pytest.raises(ValueError, match=r"line 2 of .*episodes.jsonl"):
         read_episodes(path)
-
-
-def test_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
-    take = "import sys, fcntl; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX)"
-    hold = f"{take}; print('held', flush=True); input()"
-    command = [sys.executable, "-c", hold, str(tmp_path / ".lock")]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        other.stdout.readline()
-        with pytest.raises(ValueError, match="another evaluation"), exclusive(tmp_path):
-            pass
-        other.kill()
-    with exclusive(tmp_path):
-        pass
 
 
 def test_info_has_lerobots_names_and_units_and_ours() -> None:
