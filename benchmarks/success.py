@@ -1,8 +1,9 @@
 """Success of the default preset on unseen scenes: record, keyframe, train with ``lerobot-train``, evaluate.
 
-    python benchmarks/success.py --setting=pick_and_lift --seed=0 [--output=outputs/success] [--threads=2]
+    python benchmarks/success.py --setting=pick_and_lift [--seeds 0 1] [--output=outputs/success] [--threads=2]
 
-Each setting's demonstrations are recorded once and shared by its seeds. Killed and started again, it continues. The
+Each setting's demonstrations are recorded once and shared by its seeds; with an empty list of seeds, nothing else is
+done. Killed and started again, it continues. Two processes with one thread each may train two seeds at once. The
 commands, the training time and the evaluation's figures go to ``benchmarks/results/success.json``.
 """
 
@@ -29,6 +30,7 @@ SETTINGS: dict[str, tuple[str, int, int | None]] = {
 }
 """Task, demonstrations, and the variation if it is fixed: red, then green."""
 SCENES = 100
+OUTPUT = Path("outputs/success")
 
 
 def data_stages(setting: str, folder: Path) -> list[Stage]:
@@ -67,6 +69,11 @@ def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
     ]
 
 
+def anywhere(command: str, output: Path) -> str:
+    """The command as one would type it in a checkout, with the default output folder."""
+    return command.replace(f"{config_files.folder().parent}/", "").replace(str(output), str(OUTPUT))
+
+
 def add_result(name: str, result: dict[str, Any]) -> None:
     """Put one result among the others; several benchmarks may do so at once."""
     RESULTS.parent.mkdir(exist_ok=True)
@@ -76,31 +83,37 @@ def add_result(name: str, result: dict[str, Any]) -> None:
         RESULTS.write_text(json.dumps(dict(sorted((known | {name: result}).items())), indent=2) + "\n")
 
 
+def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict[str, str]) -> None:
+    """Train and evaluate one seed and write down what came out."""
+    own = folder / f"seed_{seed}"
+    run_stages(learning_stages(setting, seed, folder), own, Console(), environment)
+    state = read_state(own)
+    (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
+    add_result(
+        f"{setting}, seed {seed}",
+        {
+            "demonstrations": SETTINGS[setting][1],
+            "threads": threads,
+            "training_minutes": round(state["train"].seconds / 60, 1),
+            **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95", "failures", "decision_ms")},
+            "commands": [anywhere(" ".join(record.command), folder.parent) for record in state.values()],
+        },
+    )
+
+
 def main() -> None:
-    """Run one setting with one training seed."""
+    """Run one setting with its training seeds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--setting", choices=SETTINGS, default="pick_and_lift")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, default=Path("outputs/success"))
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
+    parser.add_argument("--output", type=Path, default=OUTPUT)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     args = parser.parse_args()
     environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
     folder = args.output / args.setting
     run_stages(data_stages(args.setting, folder), folder, Console(), environment)
-    own = folder / f"seed_{args.seed}"
-    run_stages(learning_stages(args.setting, args.seed, folder), own, Console(), environment)
-    state = read_state(own)
-    (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
-    add_result(
-        f"{args.setting}, seed {args.seed}",
-        {
-            "demonstrations": SETTINGS[args.setting][1],
-            "threads": args.threads,
-            "training_minutes": round(state["train"].seconds / 60, 1),
-            **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95", "failures", "decision_ms")},
-            "commands": [" ".join(record.command) for record in state.values()],
-        },
-    )
+    for seed in args.seeds:
+        learn(args.setting, seed, folder, args.threads, environment)
 
 
 if __name__ == "__main__":
