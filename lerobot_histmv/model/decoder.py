@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from einops import einsum, rearrange, reduce
+from einops import einsum, rearrange, reduce, repeat
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -13,6 +13,8 @@ from lerobot_histmv.model.layers import ConvBlock, full_precision, upsample_to
 TEMPERATURE = 0.1
 LOCAL_CHANNELS = 24
 """Channels of the decoded map at stride 4."""
+PEAK_REACH = 0.05
+"""Distance [m] from the heat map's peak up to which it counts when the policy acts."""
 OFFSET_UNIT = 0.1
 """Length [m] that the second decoder's offset output sees as 1."""
 
@@ -41,6 +43,18 @@ def spatial_log_softmax(logits: Float[Tensor, "m y x"], valid: Bool[Tensor, "m y
     usable = valid | ~valid.any(dim=(-2, -1), keepdim=True)
     masked = (logits / TEMPERATURE).masked_fill(~usable, -torch.inf)
     return masked.flatten(1).log_softmax(dim=-1).view_as(logits)
+
+
+def around_peak(heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"]) -> Float[Tensor, "m y x"]:
+    """The heat within ``PEAK_REACH`` of its strongest pixel's point, scaled to sum to 1 again.
+
+    Where the heat map is torn between two objects, its expectation over all pixels lies at neither.
+    """
+    peak = heat.flatten(1).argmax(dim=1)
+    centre = cloud.flatten(2).gather(2, repeat(peak, "m -> m c 1", c=3))
+    near = (cloud - centre[..., None]).square().sum(dim=1) < PEAK_REACH**2
+    kept = heat * near
+    return kept / kept.sum(dim=(-2, -1), keepdim=True)
 
 
 class PositionDecoder(nn.Module):
@@ -125,7 +139,8 @@ class Decoder(nn.Module):
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
         with full_precision(logits):
             log_heat = spatial_log_softmax(logits.float(), valid)
-            heat = log_heat.exp()
+            # Training needs the gradient from all pixels; acting needs one object.
+            heat = log_heat.exp() if self.training else around_peak(log_heat.exp(), cloud)
             surface = einsum(heat, cloud, "m y x, m c y x -> m c")
         numbers = self.pose(maps, view, decoded, heat.detach()).float()
         return Prediction(

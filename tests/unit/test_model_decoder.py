@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lerobot_histmv.model.decoder import Decoder, Prediction, spatial_log_softmax
+from lerobot_histmv.model.decoder import Decoder, Prediction, around_peak, spatial_log_softmax
 
 M, Y, X, WIDTH = 3, 32, 48, 8
 SKIPS = [4, 5, 5, 5]
@@ -42,6 +42,18 @@ def test_heat_map_of_a_view_that_sees_nothing_is_finite_and_has_finite_gradients
     (heat * torch.arange(X)).sum().backward()
     assert logits.grad is not None
     assert logits.grad.isfinite().all()
+
+
+def test_a_heat_map_torn_between_two_objects_decides_for_the_stronger() -> None:
+    rows, columns = torch.meshgrid(torch.arange(Y), torch.arange(X), indexing="ij")
+    cloud = 0.01 * torch.stack([columns, rows, torch.zeros(Y, X)]).expand(M, 3, Y, X)
+    heat = torch.zeros(M, Y, X)
+    heat[:, 7, 5], heat[:, 7, 6], heat[:, 23, 41] = 0.4, 0.2, 0.4 - 1e-3
+    kept = around_peak(heat, cloud)
+    torch.testing.assert_close(kept.sum(dim=(1, 2)), torch.ones(M))
+    assert kept[:, 23, 41].eq(0).all(), "the other object does not pull"
+    torch.testing.assert_close(kept[:, 7, 5] / kept[:, 7, 6], torch.full((M,), 2.0))
+    assert around_peak(kept, cloud).allclose(kept)
 
 
 def inputs(seed: int = 1) -> dict[str, object]:
