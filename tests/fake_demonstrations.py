@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,7 +36,9 @@ class FakeEnv:
 
     def __init__(self, seconds: float = 0.0, crash_file: str = "", error_file: str = "") -> None:
         self.seconds, self.crash_file, self.error_file = seconds, crash_file, error_file
-        self.stage = SimpleNamespace(task=SimpleNamespace(failure=lambda: "grasp missed"))
+
+    def failure(self) -> str:
+        return "grasp missed"
 
     def reset(self, *, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
         self.seed, self.ticks = seed, 0

@@ -14,7 +14,7 @@ from dataset_tools.shards import Outcome, shard_path
 from lerobot_histmv import keys
 from lerobot_histmv.envs import make
 
-CAMERAS = ("wrist", "front")
+CAMERAS = ("front", "wrist")
 SIZE = 32
 pytest.importorskip("mujoco")
 
@@ -42,7 +42,7 @@ def test_columns_are_named_and_typed(episode: tuple[Outcome, Path, LeRobotDatase
     features = episode[2].meta.features
     assert features[keys.ACTION]["names"] == list(keys.POSE_NAMES)
     assert features[keys.STATE]["names"] == list(STATE_NAMES)
-    assert features[keys.INTRINSICS]["names"][:5] == ["wrist.fx", "wrist.fy", "wrist.cx", "wrist.cy", "front.fx"]
+    assert features[keys.INTRINSICS]["names"][:5] == ["front.fx", "front.fy", "front.cx", "front.cy", "wrist.fx"]
     assert keys.cameras_of(features[keys.EXTRINSICS]["names"]) == list(CAMERAS)
     assert episode[2].meta.depth_keys == [keys.depth_key(camera) for camera in CAMERAS]
     assert (episode[2].meta.robot_type, episode[2].meta.fps) == ("ur5e", 20)
@@ -71,8 +71,8 @@ def test_depth_is_millimetres_where_the_calibration_says(episode: tuple[Outcome,
     dataset = episode[2]
     last = dataset[len(dataset) - 1]
     depth = last[keys.depth_key("front")].numpy()[0] / 1000
-    fx, fy, cx, cy = last[keys.INTRINSICS].numpy()[4:8]
-    world_from_camera = np.vstack([last[keys.EXTRINSICS].numpy()[12:].reshape(3, 4), [0, 0, 0, 1]])
+    fx, fy, cx, cy = last[keys.INTRINSICS].numpy()[:4]
+    world_from_camera = np.vstack([last[keys.EXTRINSICS].numpy()[:12].reshape(3, 4), [0, 0, 0, 1]])
     v, u = np.nonzero(depth > 0)
     z = depth[v, u]
     points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])

@@ -76,7 +76,8 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path) -> None:
 
 
 KILLED_RUN = """
-import pathlib, sys
+import pathlib, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell start with Ctrl-C ignored
 from rich.console import Console
 from dataset_tools.stages import Stage, run_stages
 folder = pathlib.Path(sys.argv[1])
