@@ -8,17 +8,18 @@ commands, the training time and the evaluation's figures go to ``benchmarks/resu
 """
 
 import argparse
-import fcntl
 import json
 import os
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from rich.console import Console
 
 from dataset_tools import config_files
 from dataset_tools.demo import last_checkpoint, resume_training
 from dataset_tools.eval_settings import REPORTED_SEEDS
+from dataset_tools.shards import write_json
 from dataset_tools.stages import Stage, read_state, run_stages
 
 RESULTS = Path(__file__).parent / "results" / "success.json"
@@ -77,10 +78,9 @@ def anywhere(command: str, output: Path) -> str:
 def add_result(name: str, result: dict[str, Any]) -> None:
     """Put one result among the others; several benchmarks may do so at once."""
     RESULTS.parent.mkdir(exist_ok=True)
-    with (RESULTS.parent / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(RESULTS.parent / ".lock"):
         known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-        RESULTS.write_text(json.dumps(dict(sorted((known | {name: result}).items())), indent=2) + "\n")
+        write_json(RESULTS, dict(sorted((known | {name: result}).items())))
 
 
 def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict[str, str]) -> None:

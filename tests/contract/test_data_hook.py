@@ -14,7 +14,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
 
 from lerobot_histmv.configuration_histmv import HistMVConfig
-from lerobot_histmv.data import checks, hook
+from lerobot_histmv.data import hook
 from lerobot_histmv.data.reader import FrameReader
 
 
@@ -94,7 +94,9 @@ def test_settings_that_break_rgbd_training_are_refused(root: Path, flags: list[s
 )
 def test_colour_transforms_are_allowed(root: Path, tfs: str) -> None:
     flags = ("--dataset.image_transforms.enable=true", f"--dataset.image_transforms.tfs={tfs}")
-    checks.check_training(configured(root, *flags))
+    dataset, _ = lerobot_train.make_train_eval_datasets(configured(root, *flags))
+    assert isinstance(dataset.reader, FrameReader)
+    assert dataset.reader._image_transforms is not None
 
 
 def test_damaged_datasets_are_named(root: Path, tmp_path: Path) -> None:

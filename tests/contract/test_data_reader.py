@@ -127,7 +127,8 @@ def test_spawned_workers_read_the_same(root: Path) -> None:
 def test_second_use_decodes_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     both(root)
     monkeypatch.setattr("lerobot_histmv.data.reader.decode", None)
-    both(root)
+    stock, fast = both(root)
+    assert_all_same(stock, fast)
 
 
 def test_changed_dataset_is_decoded_anew_and_the_old_cache_goes(tmp_path: Path, cache: Path) -> None:
