@@ -103,15 +103,17 @@ class HistMVPolicy(PreTrainedPolicy):
         step, view = views.unbind(-1)
         target = window.target
         terms = losses.action_losses(predicted, target[step], encoding.cloud[step, view], config.loss)
-        per_pair = losses.weighted_sum(terms, config.loss)
+        # Views are judged by their actions alone: one that shows nothing near the target has no heat map loss at all.
+        acted = losses.weighted_sum({name: term for name, term in terms.items() if name != "heatmap"}, config.loss)
         if choice == "ranked":
-            shares = best_shares(encoding.weights.detach(), per_pair)
+            shares = best_shares(encoding.weights.detach(), acted)
         nothing = torch.zeros_like(seen.heat[:, 0])
-        terms = {name: nothing.index_add(0, step, shares * term) for name, term in terms.items()}
+        share = {name: shares.detach() if name == "heatmap" else shares for name in terms}
+        terms = {name: nothing.index_add(0, step, share[name] * term) for name, term in terms.items()}
         terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
-            terms["choice"] = self._choice_loss(encoding, seen.text, view, per_pair)
-        if self.training and self.net.semantics.text_is_trained:
+            terms["choice"] = self._choice_loss(encoding, seen.text, view, acted)
+        if self.training and self.net.semantics.text_is_trained and config.instructions:
             terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 

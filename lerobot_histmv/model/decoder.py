@@ -16,7 +16,7 @@ LOCAL_CHANNELS = 24
 PEAK_REACH = 0.05
 """Distance [m] from the heat map's peak up to which it counts when the policy acts."""
 OFFSET_UNIT = 0.1
-"""Length [m] that the second decoder's offset output sees as 1."""
+"""Length [m] that the second decoder's offset outputs see as 1."""
 
 
 @dataclass
@@ -57,6 +57,25 @@ def around_peak(heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"]) -
     return kept / kept.sum(dim=(-2, -1), keepdim=True)
 
 
+class Merge(nn.Module):
+    """A decoded map joined with a finer skip: convolve each at its own size, add, normalise, leaky ReLU.
+
+    This is a convolution of both maps side by side, except that the coarse one is upsampled after its part of the
+    convolution instead of before: a quarter of the work there, and no copy to put the maps together.
+    """
+
+    def __init__(self, coarse: int, skip: int, channels_out: int, normalise: bool) -> None:
+        super().__init__()
+        self.coarse = nn.Conv2d(coarse, channels_out, 3, padding=1, bias=False)
+        self.skip = nn.Conv2d(skip, channels_out, 3, padding=1)
+        self.norm = nn.GroupNorm(4, channels_out) if normalise else nn.Identity()
+
+    def forward(self, maps: Float[Tensor, "m c y x"], skip: Float[Tensor, "m s y2 x2"]) -> Float[Tensor, "m e y2 x2"]:
+        """Decoded map of the skip's height and width."""
+        joined = self.skip(skip) + upsample_to(self.coarse(maps), skip)
+        return functional.leaky_relu(self.norm(joined), 0.02)
+
+
 class PositionDecoder(nn.Module):
     """Upsampling path with PANet skips to one heat map over the view's pixels."""
 
@@ -65,7 +84,7 @@ class PositionDecoder(nn.Module):
         channels = [width, 32, LOCAL_CHANNELS, 8]
         skips = skip_channels[::-1]
         self.merge = nn.ModuleList(
-            ConvBlock(channels[max(i - 1, 0)] + skip, channels[i], normalise=i < 3) for i, skip in enumerate(skips)
+            Merge(channels[max(i - 1, 0)], skip, channels[i], normalise=i < 3) for i, skip in enumerate(skips)
         )
         self.heat = nn.Conv2d(channels[-1], 1, 3, padding=1)
 
@@ -78,15 +97,14 @@ class PositionDecoder(nn.Module):
         """
         decoded = []
         for merge, skip in zip(self.merge, reversed(skips), strict=True):
-            joined = torch.cat([upsample_to(maps, skip), skip], dim=1)
-            maps = merge(joined.contiguous(memory_format=torch.channels_last))
+            maps = merge(maps, skip)
             decoded.append(maps)
         logits = functional.interpolate(self.heat(maps), size=size, mode="bilinear", align_corners=False)
         return rearrange(logits, "m 1 y x -> m y x"), decoded[-2]
 
 
 class PoseDecoder(nn.Module):
-    """Two convolutions, pooling and two dense layers: offset, quaternion and gripper, 8 numbers.
+    """Two convolutions, pooling and two dense layers: offset, quaternion, gripper and depth, 9 numbers.
 
     Beside the paper's pooled map, the dense layers see the decoded map where the heat map points: the turn of an object
     and the way from its surface to its centre are local.
@@ -95,7 +113,7 @@ class PoseDecoder(nn.Module):
     def __init__(self, width: int, local: int) -> None:
         super().__init__()
         self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
-        self.dense = nn.Sequential(nn.Linear(4 * width + local, 2 * width), nn.GELU(), nn.Linear(2 * width, 8))
+        self.dense = nn.Sequential(nn.Linear(4 * width + local, 2 * width), nn.GELU(), nn.Linear(2 * width, 9))
 
     def forward(
         self,
@@ -103,8 +121,8 @@ class PoseDecoder(nn.Module):
         view: Float[Tensor, "m d h w"],
         decoded: Float[Tensor, "m c y4 x4"],
         heat: Float[Tensor, "m y x"],
-    ) -> Float[Tensor, "m 8"]:
-        """Eight numbers from the history map F_t, the chosen view's features FR_t, the decoded map and the heat map."""
+    ) -> Float[Tensor, "m 9"]:
+        """Nine numbers from the history map F_t, the chosen view's features FR_t, the decoded map and the heat map."""
         pooled = functional.adaptive_avg_pool2d(self.convolve(torch.cat([maps, view], dim=1)), 2)
         share = reduce(heat, "m (y i) (x j) -> m y x", "sum", y=decoded.shape[2], x=decoded.shape[3])
         local = einsum(share, decoded, "m y x, m c y x -> m c")
@@ -126,8 +144,12 @@ class Decoder(nn.Module):
         skips: list[Float[Tensor, "m _ _ _"]],
         cloud: Float[Tensor, "m 3 y x"],
         valid: Bool[Tensor, "m y x"],
+        eye: Float[Tensor, "m 3"],
     ) -> Prediction:
         """Decode (step, view) pairs.
+
+        A view sees the near side of an object, its centre lies deeper along the ray: that part of the way from surface
+        to key pose turns with the camera and has a number of its own beside the offset in the world's axes.
 
         Args:
             maps: history-enriched map F_t of the step.
@@ -135,6 +157,7 @@ class Decoder(nn.Module):
             skips: the view's PANet levels, fine to coarse.
             cloud: world coordinates of the view's pixels [m].
             valid: pixels with a measurement inside the workspace.
+            eye: position of the view's camera [m].
         """
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
         with full_precision(logits):
@@ -142,9 +165,10 @@ class Decoder(nn.Module):
             # Training needs the gradient from all pixels; acting needs one object.
             heat = log_heat.exp() if self.training else around_peak(log_heat.exp(), cloud)
             surface = einsum(heat, cloud, "m y x, m c y x -> m c")
+            ray = functional.normalize(surface - eye, dim=-1)
         numbers = self.pose(maps, view, decoded, heat.detach()).float()
         return Prediction(
-            position=surface + OFFSET_UNIT * numbers[:, :3],
+            position=surface + OFFSET_UNIT * (numbers[:, :3] + numbers[:, 8:] * ray),
             surface=surface,
             quaternion=functional.normalize(numbers[:, 3:7], dim=-1, eps=1e-6),
             gripper=numbers[:, 7],

@@ -53,6 +53,7 @@ class Encoding:
         cloud: world coordinates of every pixel [m].
         valid: pixels with a measurement inside the workspace.
         weights: view weights w.
+        eyes: position of every camera [m].
     """
 
     fused: Float[Tensor, "n d h w"]
@@ -62,6 +63,7 @@ class Encoding:
     cloud: Float[Tensor, "n k 3 y x"]
     valid: Bool[Tensor, "n k y x"]
     weights: Float[Tensor, "n k"]
+    eyes: Float[Tensor, "n k 3"]
 
 
 class HistMVNet(nn.Module):
@@ -114,7 +116,7 @@ class HistMVNet(nn.Module):
         points = self.points(cloud, seen.rgb, valid)
         maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
-        return Encoding(fuse_views(maps, weights), maps, features, skips, cloud, valid, weights)
+        return Encoding(fuse_views(maps, weights), maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3])
 
     def remember(
         self, fused: Float[Tensor, "n d h w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
@@ -137,6 +139,7 @@ class HistMVNet(nn.Module):
             [skip[image] for skip in encoding.skips],
             encoding.cloud.flatten(0, 1)[image],
             encoding.valid.flatten(0, 1)[image],
+            encoding.eyes.flatten(0, 1)[image],
         )
 
     @staticmethod

@@ -183,3 +183,21 @@ def test_no_weight_is_idle_beside_the_sentence_encoder() -> None:
     policy = tiny_policy(tiny_config(network=network)).train()
     policy(training_batch())[0].backward()
     assert [name for name, p in policy.named_parameters() if p.requires_grad and p.grad is None] == []
+
+
+def test_policy_without_recorded_wordings_trains() -> None:
+    loss, log = tiny_policy(tiny_config(instructions={})).train()(training_batch())
+    assert loss.isfinite()
+    assert "paraphrase" not in log
+
+
+@pytest.mark.parametrize("choice", ["ranked", "sampled"])
+def test_views_are_judged_by_their_actions_not_by_heat_maps_that_a_blind_view_lacks(choice: str) -> None:
+    network = tiny_network(views=ViewConfig(train_choice=choice))
+    terms = []
+    for heatmap in (0.0, 7.0):
+        policy = tiny_policy(tiny_config(network=network, loss=LossConfig(heatmap=heatmap))).train()
+        torch.manual_seed(1)
+        terms.append(policy(training_batch())[1])
+    assert terms[0]["choice"] == terms[1]["choice"]
+    assert terms[0]["position"] == terms[1]["position"]

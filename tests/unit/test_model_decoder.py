@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lerobot_histmv.model.decoder import Decoder, Prediction, around_peak, spatial_log_softmax
+from lerobot_histmv.model.decoder import OFFSET_UNIT, Decoder, Prediction, around_peak, spatial_log_softmax
 
 M, Y, X, WIDTH = 3, 32, 48, 8
 SKIPS = [4, 5, 5, 5]
@@ -70,6 +70,7 @@ def inputs(seed: int = 1) -> dict[str, object]:
         "skips": skips,
         "cloud": cloud,
         "valid": torch.rand(M, Y, X, generator=generator) < 0.7,
+        "eye": torch.randn(M, 3, generator=generator),
     }
 
 
@@ -106,10 +107,20 @@ def test_position_is_the_heat_map_s_mean_over_the_cloud_plus_an_offset() -> None
     found = decode(module, given)
     expected = (found.log_heat.exp()[:, None] * given["cloud"]).sum(dim=(2, 3))
     torch.testing.assert_close(found.surface, expected)
-    given["cloud"] = given["cloud"] + 3
+    given["cloud"], given["eye"] = given["cloud"] + 3, given["eye"] + 3
     moved = decode(module, given)
     torch.testing.assert_close(moved.surface, found.surface + 3)
     torch.testing.assert_close(moved.position - moved.surface, found.position - found.surface, atol=1e-5, rtol=0)
+
+
+def test_depth_number_moves_the_position_along_the_ray_from_the_camera() -> None:
+    given, module = inputs(), decoder()
+    last = module.pose.dense[-1]
+    nn.init.zeros_(last.weight)
+    last.bias.data = torch.tensor([0.0, 0, 0, 1, 0, 0, 0, 0, 0.2])
+    found = decode(module, given)
+    ray = (found.surface - given["eye"]) / (found.surface - given["eye"]).norm(dim=1, keepdim=True)
+    torch.testing.assert_close(found.position, found.surface + 0.2 * OFFSET_UNIT * ray)
 
 
 def test_heat_map_learns_to_point_at_a_target_on_the_cloud() -> None:
