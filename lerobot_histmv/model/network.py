@@ -116,7 +116,9 @@ class HistMVNet(nn.Module):
         points = self.points(cloud, seen.rgb, valid)
         maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
-        return Encoding(fuse_views(maps, weights), maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3])
+        return Encoding(
+            fuse_views(maps, weights), maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3]
+        )
 
     def remember(
         self, fused: Float[Tensor, "n d h w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
