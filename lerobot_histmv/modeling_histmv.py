@@ -17,7 +17,7 @@ from lerobot_histmv.data.instructions import load_paraphrases
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
-from lerobot_histmv.model.view_attention import best_shares, choice_loss, choose_views, ranking_loss
+from lerobot_histmv.model.view_attention import best_shares, choice_loss, ranking_loss
 from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
 
 Batch = dict[str, Any]
@@ -97,7 +97,7 @@ class HistMVPolicy(PreTrainedPolicy):
             if self.training:
                 window = self._augment(window)
             seen = window.observe(text)
-        choice = config.network.views.train_choice if self.training else "argmax"
+        choice = config.network.views.train_choice if self.training else "best"
         encoding, predicted, views, shares = self.net(seen, window.real, choice)
 
         step, view = views.unbind(-1)
@@ -145,8 +145,7 @@ class HistMVPolicy(PreTrainedPolicy):
         real = torch.ones(len(window.tool), len(self._fused), dtype=torch.bool, device=window.tool.device)
         fused = rearrange(torch.stack(list(self._fused), dim=1), "b t d h w -> (b t) d h w")
         enriched = self.net.remember(fused, text.repeat_interleave(len(self._fused), dim=0), real)
-        views = choose_views(encoding.weights, "argmax")[0]
-        predicted = self.net.decode(encoding, enriched[len(self._fused) - 1 :: len(self._fused)], views)
+        predicted, views = self.net.decode_best(encoding, enriched[len(self._fused) - 1 :: len(self._fused)])
         self.last_decision = Decision(encoding.weights, views[:, 1], predicted.log_heat.exp(), predicted.surface)
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)
 

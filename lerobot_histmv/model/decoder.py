@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from einops import einsum, rearrange, reduce, repeat
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -29,6 +29,7 @@ class Prediction:
         quaternion: w, x, y, z, unit.
         gripper: logit of "open".
         log_heat: log-probabilities over the pixels of the view; -inf where the cloud is invalid.
+        certainty: share of the heat near its peak when the policy acts; 1 in training, which does not ask.
     """
 
     position: Float[Tensor, "m 3"]
@@ -36,6 +37,11 @@ class Prediction:
     quaternion: Float[Tensor, "m 4"]
     gripper: Float[Tensor, " m"]
     log_heat: Float[Tensor, "m y x"]
+    certainty: Float[Tensor, " m"]
+
+    def at(self, rows: Int[Tensor, " r"]) -> "Prediction":
+        """The predictions of the given pairs."""
+        return Prediction(**{name: values[rows] for name, values in vars(self).items()})
 
 
 def spatial_log_softmax(logits: Float[Tensor, "m y x"], valid: Bool[Tensor, "m y x"]) -> Float[Tensor, "m y x"]:
@@ -45,8 +51,10 @@ def spatial_log_softmax(logits: Float[Tensor, "m y x"], valid: Bool[Tensor, "m y
     return masked.flatten(1).log_softmax(dim=-1).view_as(logits)
 
 
-def around_peak(heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"]) -> Float[Tensor, "m y x"]:
-    """The heat within ``PEAK_REACH`` of its strongest pixel's point, scaled to sum to 1 again.
+def around_peak(
+    heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"]
+) -> tuple[Float[Tensor, "m y x"], Float[Tensor, " m"]]:
+    """The heat within ``PEAK_REACH`` of its strongest pixel's point, scaled to sum to 1 again, and its share of all.
 
     Where the heat map is torn between two objects, its expectation over all pixels lies at neither.
     """
@@ -54,7 +62,8 @@ def around_peak(heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"]) -
     centre = cloud.flatten(2).gather(2, repeat(peak, "m -> m c 1", c=3))
     near = (cloud - centre[..., None]).square().sum(dim=1) < PEAK_REACH**2
     kept = heat * near
-    return kept / kept.sum(dim=(-2, -1), keepdim=True)
+    share = kept.sum(dim=(-2, -1))
+    return kept / share[:, None, None], share
 
 
 class Merge(nn.Module):
@@ -162,8 +171,9 @@ class Decoder(nn.Module):
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
         with full_precision(logits):
             log_heat = spatial_log_softmax(logits.float(), valid)
-            # Training needs the gradient from all pixels; acting needs one object.
-            heat = log_heat.exp() if self.training else around_peak(log_heat.exp(), cloud)
+            heat, certainty = log_heat.exp(), torch.ones_like(log_heat[:, 0, 0])
+            if not self.training:  # training needs the gradient from all pixels; acting needs one object
+                heat, certainty = around_peak(heat, cloud)
             surface = einsum(heat, cloud, "m y x, m c y x -> m c")
             ray = functional.normalize(surface - eye, dim=-1)
         numbers = self.pose(maps, view, decoded, heat.detach()).float()
@@ -173,4 +183,5 @@ class Decoder(nn.Module):
             quaternion=functional.normalize(numbers[:, 3:7], dim=-1, eps=1e-6),
             gripper=numbers[:, 7],
             log_heat=log_heat,
+            certainty=certainty,
         )

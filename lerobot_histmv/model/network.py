@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from einops import reduce
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -15,7 +16,7 @@ from lerobot_histmv.model.history import History
 from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.points import PointEncoder
 from lerobot_histmv.model.semantics import Semantics
-from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views
+from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views, most_informative
 
 
 @dataclass
@@ -94,12 +95,15 @@ class HistMVNet(nn.Module):
     def forward(
         self, seen: Observation, real: Bool[Tensor, "b t"], choice: str
     ) -> tuple[Encoding, Prediction, Int[Tensor, "m 2"], Float[Tensor, " m"]]:
-        """Encode the real steps of b windows and decode them from the views that ``choice`` picks.
+        """Encode the real steps of b windows and decode them from the views that ``choice`` picks, or from the "best".
 
         Returns the encoding, the decoded (step, view) pairs, the pairs, and each pair's share of its step's loss.
         """
         encoding = self.encode(seen)
         enriched = self.remember(encoding.fused, seen.text, real)
+        if choice == "best":
+            predicted, views = self.decode_best(encoding, enriched)
+            return encoding, predicted, views, torch.ones_like(predicted.certainty)
         views, shares = choose_views(encoding.weights, choice)
         return encoding, self.decode(encoding, enriched, views), views, shares
 
@@ -143,6 +147,20 @@ class HistMVNet(nn.Module):
             encoding.valid.flatten(0, 1)[image],
             encoding.eyes.flatten(0, 1)[image],
         )
+
+    def decode_best(
+        self, encoding: Encoding, enriched: Float[Tensor, "n d h w"]
+    ) -> tuple[Prediction, Int[Tensor, "n 2"]]:
+        """Decode every view and keep, of each step, the one with the largest product of weight and certainty.
+
+        The weights know how good a view usually is; that the arm hides the target in it shows in a torn heat map.
+        """
+        views = choose_views(encoding.weights, "expected")[0]
+        predicted = self.decode(encoding, enriched, views)
+        n, k = encoding.weights.shape
+        best = most_informative(encoding.weights * predicted.certainty.view(n, k))
+        rows = torch.arange(n, device=best.device) * k + best
+        return predicted.at(rows), views[rows]
 
     @staticmethod
     def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:

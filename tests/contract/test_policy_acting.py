@@ -46,7 +46,7 @@ def whole_window(policy: HistMVPolicy, rows: dict[str, torch.Tensor], steps: int
     assert window.real.shape == (1, steps)
     seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
     with torch.no_grad():
-        return policy.net(seen, window.real, "argmax")
+        return policy.net(seen, window.real, "best")
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, LONG])

@@ -27,7 +27,7 @@ def assert_same(first: Prediction, second: Prediction, rows: slice | torch.Tenso
 def decide(net: HistMVNet, seen: Observation) -> tuple[torch.Tensor, Prediction, torch.Tensor]:
     """View weights, prediction from the best view, and that view, of unrelated steps."""
     with torch.no_grad():
-        encoding, predicted, views, _ = net(seen, torch.ones(len(seen.depth), 1, dtype=torch.bool), "argmax")
+        encoding, predicted, views, _ = net(seen, torch.ones(len(seen.depth), 1, dtype=torch.bool), "best")
     return encoding.weights, predicted, views[:, 1]
 
 
@@ -39,12 +39,26 @@ def net() -> HistMVNet:
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
 def test_one_network_serves_any_number_of_views(net: HistMVNet, k: int) -> None:
     seen = tiny_observation(2, k, net.semantics.text_width)
-    weights, predicted, view = decide(net, seen)
+    weights, predicted, _ = decide(net, seen)
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(2))
     assert weights.shape == (2, k)
-    assert view.equal(weights.argmax(dim=1))
     assert predicted.log_heat.shape == (2, *SIZE)
     assert all(values.isfinite().all() for values in (predicted.position, predicted.quaternion, predicted.gripper))
+
+
+def test_the_view_that_acts_has_the_largest_product_of_weight_and_certainty(net: HistMVNet) -> None:
+    n, k = 7, 3
+    seen = tiny_observation(n, k, net.semantics.text_width)
+    with torch.no_grad():
+        encoding = net.encode(seen)
+        enriched = net.remember(encoding.fused, seen.text, torch.ones(n, 1, dtype=torch.bool))
+        every = net.decode(encoding, enriched, torch.cartesian_prod(torch.arange(n), torch.arange(k)))
+        best, views = net.decode_best(encoding, enriched)
+    worth = encoding.weights * every.certainty.view(n, k)
+    assert views[:, 0].equal(torch.arange(n))
+    assert views[:, 1].equal(worth.argmax(dim=1))
+    assert_same(best, every.at(torch.arange(n) * k + views[:, 1]))
+    assert ((every.certainty > 0) & (every.certainty <= 1 + 1e-6)).all()
 
 
 def in_order(seen: Observation, order: list[int]) -> Observation:
@@ -136,7 +150,7 @@ def replay(net: HistMVNet, rows: Window) -> Prediction:
     """Predictions of every real row."""
     text = net.semantics.text(["lift the cube"] * len(rows.real), torch.device("cpu"))
     with torch.no_grad():
-        return net(rows.observe(text), rows.real, "argmax")[1]
+        return net(rows.observe(text), rows.real, "best")[1]
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["first two alone", "all history"])

@@ -49,11 +49,14 @@ def test_a_heat_map_torn_between_two_objects_decides_for_the_stronger() -> None:
     cloud = 0.01 * torch.stack([columns, rows, torch.zeros(Y, X)]).expand(M, 3, Y, X)
     heat = torch.zeros(M, Y, X)
     heat[:, 7, 5], heat[:, 7, 6], heat[:, 23, 41] = 0.4, 0.2, 0.4 - 1e-3
-    kept = around_peak(heat, cloud)
+    kept, share = around_peak(heat, cloud)
+    torch.testing.assert_close(share, torch.full((M,), 0.6))
     torch.testing.assert_close(kept.sum(dim=(1, 2)), torch.ones(M))
     assert kept[:, 23, 41].eq(0).all(), "the other object does not pull"
     torch.testing.assert_close(kept[:, 7, 5] / kept[:, 7, 6], torch.full((M,), 2.0))
-    assert around_peak(kept, cloud).allclose(kept)
+    again, everything = around_peak(kept, cloud)
+    torch.testing.assert_close(again, kept)
+    torch.testing.assert_close(everything, torch.ones(M))
 
 
 def inputs(seed: int = 1) -> dict[str, object]:
