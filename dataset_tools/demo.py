@@ -19,9 +19,6 @@ TRAINING = "train"
 EVALUATION = "evaluation"
 PAGE = "index.html"
 
-FIRST_EVALUATION_SEED = 200_000
-"""Scenes of reported evaluations start here; recording and evaluation during training use smaller seeds."""
-
 OFFLINE = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false"}
 """The demo fetches nothing, and says so to the libraries that would ask."""
 
@@ -64,7 +61,7 @@ def stages(config: DemoConfig) -> list[Stage]:
     )  # fmt: skip
     evaluate = (
         "histmv", "eval", f"--policy.path={last_checkpoint(training)}", "--env.type=ur5", f"--env.task={config.task}",
-        f"--eval.n_episodes={config.scenes}", f"--seed={FIRST_EVALUATION_SEED}", f"--output_dir={evaluation}",
+        f"--eval.n_episodes={config.scenes}", f"--output_dir={evaluation}",
     )  # fmt: skip
     return [
         Stage("record", f"record {config.episodes} demonstrations of {config.task}", record),

@@ -84,7 +84,8 @@ def test_heat_loss_is_finite_with_invalid_pixels_and_for_a_view_without_any() ->
 def prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor]:
     log_heat, cloud, position = heat_case()
     gripper = torch.tensor([2.0, -1.0, 0.5])
-    predicted = Prediction(position + torch.tensor([0.0, 0.03, 0.04]), position, unit(M, 2), gripper, log_heat)
+    reached = position + torch.tensor([0.0, 0.03, 0.04])
+    predicted = Prediction(reached, position, unit(M, 2), gripper, log_heat, certainty=torch.ones(M))
     return predicted, torch.cat([position, unit(M, 3), torch.tensor([[1.0], [0.0], [0.0]])], dim=1), cloud
 
 
