@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
-from lerobot_histmv.data.instructions import load_paraphrases
+from lerobot_histmv.data.instructions import load_paraphrases, meanings
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
@@ -54,6 +54,7 @@ class HistMVPolicy(PreTrainedPolicy):
         if dataset_meta is not None:  # what the configuration or a checkpoint knows stays
             config.instructions = load_paraphrases(dataset_meta.root, dataset_meta.tasks.index) | config.instructions
         self.net = HistMVNet(config.network, config.image_size)
+        self._meanings = meanings(config.instructions)
         self._warned: set[str] = set()
         self.reset()
 
@@ -113,7 +114,7 @@ class HistMVPolicy(PreTrainedPolicy):
         terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
             terms["choice"] = self._choice_loss(encoding, seen.text, view, acted)
-        if self.training and self.net.semantics.text_is_trained and config.instructions:
+        if self.training and self.net.semantics.text_is_trained and self._meanings:
             terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 
@@ -185,10 +186,9 @@ class HistMVPolicy(PreTrainedPolicy):
 
     def _paraphrase_loss(self, device: torch.device) -> Float[Tensor, ""]:
         """Two wordings of each of a few random instructions, told apart by meaning."""
-        meanings = sorted({tuple(sorted(wordings)) for wordings in self.config.instructions.values()})
-        picked = torch.randperm(len(meanings))[:MEANINGS].tolist()
-        pairs = [torch.randperm(len(meanings[i]))[:2].tolist() for i in picked]
-        sentences = [meanings[i][j] for i, pair in zip(picked, pairs, strict=True) for j in pair]
+        picked = torch.randperm(len(self._meanings))[:MEANINGS].tolist()
+        pairs = [torch.randperm(len(self._meanings[i]))[:2].tolist() for i in picked]
+        sentences = [self._meanings[i][j] for i, pair in zip(picked, pairs, strict=True) for j in pair]
         owners = torch.tensor([i for i, pair in zip(picked, pairs, strict=True) for _ in pair], device=device)
         return losses.paraphrase_loss(self.net.semantics.text(sentences, device), owners)
 

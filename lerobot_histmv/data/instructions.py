@@ -20,6 +20,15 @@ def load_paraphrases(root: str | Path, recorded: Iterable[str]) -> dict[str, lis
     return {task: list(dict.fromkeys([task, *stored.get(task, [])])) for task in recorded}
 
 
+def meanings(paraphrases: dict[str, list[str]]) -> list[list[str]]:
+    """All wordings, sorted and grouped by what they mean: lists that share a sentence mean the same."""
+    groups: list[set[str]] = []
+    for wordings in paraphrases.values():
+        same = [group for group in groups if not group.isdisjoint(wordings)]
+        groups = [group for group in groups if group not in same] + [set(wordings).union(*same)]
+    return sorted(sorted(group) for group in groups)
+
+
 def _read(path: Path) -> dict[str, list[str]]:
     expected = "it must be a JSON object: recorded instruction -> list of paraphrases"
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_histmv import keys
-from lerobot_histmv.data.instructions import load_paraphrases
+from lerobot_histmv.data.instructions import load_paraphrases, meanings
 
 
 def stored(root: Path, content: object) -> Path:
@@ -30,3 +30,8 @@ def test_a_dataset_without_paraphrases_has_its_own_wording(tmp_path: Path) -> No
 def test_malformed_files_are_named(tmp_path: Path, content: object) -> None:
     with pytest.raises(ValueError, match=r"instructions\.json .* recorded instruction -> list of paraphrases"):
         load_paraphrases(stored(tmp_path, content), ["wave"])
+
+
+def test_lists_that_share_a_sentence_mean_the_same() -> None:
+    paraphrases = {"lift": ["lift", "raise"], "wave": ["wave"], "hoist": ["hoist", "elevate"], "up": ["raise", "hoist"]}
+    assert meanings(paraphrases) == [["elevate", "hoist", "lift", "raise"], ["wave"]]
