@@ -40,15 +40,34 @@ class Pose:
     position: Float[np.ndarray, " 3"]
     quaternion: Float[np.ndarray, " 4"]
 
+    def moved(self, offset: Point) -> "Pose":
+        """The same orientation, ``offset`` [m, base frame] away."""
+        return Pose(self.position + np.asarray(offset, dtype=np.float64), self.quaternion)
+
     def raised(self, height: float) -> "Pose":
         """The same pose ``height`` [m] further up."""
-        return Pose(self.position + np.array([0, 0, height]), self.quaternion)
+        return self.moved((0, 0, height))
+
+    def retracted(self, distance: float) -> "Pose":
+        """The same pose ``distance`` [m] back along the tool's own z axis, towards the wrist."""
+        return self.moved(distance * _rotation(self).as_matrix()[:, 2])
+
+    def turned(self, axis: Point, angle: float, pivot: Point | None = None) -> "Pose":
+        """Turned by ``angle`` [rad] about ``axis`` (base frame, unit) through ``pivot`` [m]; None: about itself."""
+        turn = Rotation.from_rotvec(angle * np.asarray(axis, dtype=np.float64))
+        centre = self.position if pivot is None else np.asarray(pivot, dtype=np.float64)
+        position = centre + turn.apply(self.position - centre)
+        return Pose(position, canonical((turn * _rotation(self)).as_quat(scalar_first=True)))
 
 
 def top_down(position: Point, yaw: float = 0.0) -> Pose:
     """Pose of a gripper that points straight down, its fingers apart along the y axis turned by ``yaw`` [rad]."""
     quaternion = canonical([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     return Pose(np.asarray(position, dtype=np.float64), quaternion)
+
+
+def _rotation(pose: Pose) -> Rotation:
+    return Rotation.from_quat(pose.quaternion, scalar_first=True)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ DRIVER_CLOSED = 0.8
 class Simulation:
     """One MuJoCo model and its state.
 
+    Objects go by their name ("cube0"), their parts by name and part ("cabinet/top").
+
     Args:
         objects: object name -> description file, see ``scene.build_model``.
         render_size: largest image side [pixels] that will be rendered.
@@ -45,6 +47,7 @@ class Simulation:
         self._tool = self.model.site(scene.TOOL_SITE).id
         self._pads = [frozenset(self.model.geom(name).id for name in pads) for pads in scene.PADS.values()]
         self._steps = round(TICK / self.model.opt.timestep)
+        self._geoms_of: dict[str, frozenset[int]] = {}
         self.after_tick: list[Callable[[], None]] = []
 
     def _tool_in_wrist(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
@@ -92,33 +95,73 @@ class Simulation:
         return float(np.clip(1 - self.data.qpos[self._driver] / DRIVER_CLOSED, 0, 1))
 
     def position(self, name: str) -> Float[np.ndarray, " 3"]:
-        """Position [m] of an object."""
-        return self.data.body(f"{name}_body").xpos.copy()
+        """Position [m] of an object or of one of its parts."""
+        return self.data.body(_full(name, "body")).xpos.copy()
+
+    def rotation(self, name: str) -> Float[np.ndarray, "3 3"]:
+        """Orientation of an object or of one of its parts; the columns are its axes in the base frame."""
+        return self.data.body(_full(name, "body")).xmat.reshape(3, 3).copy()
 
     def yaw(self, name: str) -> float:
         """Angle [rad] of an object about world z."""
-        rotation = self.data.body(f"{name}_body").xmat
-        return float(np.arctan2(rotation[3], rotation[0]))
+        rotation = self.rotation(name)
+        return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
-    def slide(self, name: str) -> float:
-        """Position [m] of an object's own one-degree-of-freedom joint."""
-        return float(self.data.joint(f"{name}_joint").qpos[0])
+    def site(self, name: str) -> Pose:
+        """Pose of an object's site; a site that marks a grasp has the tool's axes."""
+        site = self.data.site(_full(name, "grasp"))
+        return Pose(site.xpos.copy(), quaternion_from_matrix(site.xmat.reshape(3, 3)))
+
+    def joint(self, name: str) -> float:
+        """Position [m or rad] of an object's joint with one degree of freedom."""
+        return float(self.data.joint(_full(name, "joint")).qpos[0])
 
     def place_free(self, name: str, position: Point, yaw: float) -> None:
         """Put an object that has a free joint somewhere."""
-        self.data.joint(f"{name}_joint").qpos[:] = [*position, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        self.data.joint(_full(name, "joint")).qpos[:] = [*position, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
 
-    def place_fixed(self, name: str, position: Point) -> None:
+    def place_fixed(self, name: str, position: Point, yaw: float = 0.0) -> None:
         """Put an object that is fixed to the world somewhere."""
-        self.model.body(f"{name}_body").pos[:] = position
+        body = self.model.body(_full(name, "body"))
+        body.pos[:] = position
+        body.quat[:] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+
+    def latch(self, name: str, closed: bool) -> None:
+        """Switch an equality constraint of an object on or off, until the next reset."""
+        self.data.eq_active[self.model.equality(_full(name, "latch")).id] = closed
 
     def paint(self, name: str, rgb: Iterable[float]) -> None:
-        """Colour an object's ``paint`` geom."""
-        self.model.geom(f"{name}_paint").rgba[:] = [*rgb, 1]
+        """Colour all that has an object's material ``paint``."""
+        self.model.material(_full(name, "paint")).rgba[:] = [*rgb, 1]
 
     def gripped(self, name: str) -> bool:
-        """Whether both finger pads touch an object's ``paint`` geom."""
-        geom = self.model.geom(f"{name}_paint").id
-        contacts = self.data.contact.geom[: self.data.ncon]
-        partners = set(contacts[contacts[:, 0] == geom, 1]) | set(contacts[contacts[:, 1] == geom, 0])
+        """Whether both finger pads touch an object or part."""
+        partners = self._touching(self._geoms(name))
         return all(partners & pad for pad in self._pads)
+
+    def touch(self, first: str, second: str) -> bool:
+        """Whether two objects or parts touch each other."""
+        return bool(self._touching(self._geoms(first)) & self._geoms(second))
+
+    def _touching(self, geoms: frozenset[int]) -> set[int]:
+        """Geoms in contact with any of ``geoms``."""
+        pairs = self.data.contact.geom[: self.data.ncon].tolist()
+        return {b for a, b in pairs if a in geoms} | {a for a, b in pairs if b in geoms}
+
+    def _geoms(self, name: str) -> frozenset[int]:
+        """All geoms of an object or part and of what hangs on it."""
+        if name not in self._geoms_of:
+            root = self.model.body(_full(name, "body")).id
+            bodies = {root}
+            for body in range(root + 1, self.model.nbody):  # children come after their parents
+                if self.model.body_parentid[body] in bodies:
+                    bodies.add(body)
+            owners = self.model.geom_bodyid.tolist()
+            self._geoms_of[name] = frozenset(geom for geom, owner in enumerate(owners) if owner in bodies)
+        return self._geoms_of[name]
+
+
+def _full(name: str, default: str) -> str:
+    """Name in the model: ``object`` means its element ``default``, ``object/element`` another one."""
+    owner, _, element = name.partition("/")
+    return f"{owner}_{element or default}"

@@ -5,7 +5,8 @@ from collections import Counter
 import pytest
 
 from lerobot_histmv.envs import TASKS
-from lerobot_histmv.envs.tasks.base import COLORS, HELD_OUT_COLORS, SPLITS
+from lerobot_histmv.envs.tasks.base import SPLITS
+from lerobot_histmv.envs.tasks.colors import COLORS, HELD_OUT_COLORS
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -1,7 +1,7 @@
 """What a task is: objects, variations, success, failure, instructions and a scripted expert."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -14,17 +14,6 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "held_out")
 """Instructions for recording and training, and paraphrases kept back for evaluation."""
-COLORS = {
-    "red": (0.85, 0.1, 0.1),
-    "green": (0.1, 0.65, 0.2),
-    "blue": (0.1, 0.25, 0.85),
-    "yellow": (0.95, 0.8, 0.1),
-    "purple": (0.55, 0.15, 0.7),
-    "cyan": (0.1, 0.75, 0.8),
-}
-"""The six colours of the tasks (RGB)."""
-HELD_OUT_COLORS = {"orange": (0.95, 0.45, 0.05), "pink": (0.95, 0.45, 0.65), "white": (0.92, 0.92, 0.92)}
-"""Colours that no task uses, kept for tests of generalisation."""
 WORKSPACE = np.array([[0.3, 0.6], [-0.28, 0.28]])
 """Range of x and of y [m] in which objects lie."""
 
@@ -32,37 +21,23 @@ WORKSPACE = np.array([[0.3, 0.6], [-0.28, 0.28]])
 class Task(ABC):
     """One task; an instance holds the state of one episode.
 
-    A variation is what the instruction asks for: a sequence of colours, in order. ``slots`` lists the scene's objects:
-    those of the named colours, in order, then the distractors.
+    A variation is what the instruction asks for: the words that fill the gaps of the templates.
     """
 
     name: ClassVar[str]
     objects: ClassVar[Mapping[str, str]]
-    """Object name -> description in ``envs/objects``; at least as many as the longest variation names."""
+    """Object name -> description in ``envs/objects``."""
     variations: ClassVar[tuple[tuple[str, ...], ...]]
+    templates: ClassVar[Mapping[str, tuple[str, ...]]]
+    """Split -> paraphrases, with a pair of braces for each word of the variation."""
     initial_gripper: ClassVar[float] = 1.0
     """Gripper command at the start: 1 open, 0 closed."""
 
     def reset(self, simulation: "Simulation", variation: int, rng: np.random.Generator) -> None:
-        """Colour and place all objects and forget the last episode; ``rng`` decides what the variation leaves open."""
+        """Place all objects and forget the last episode; ``rng`` decides what the variation leaves open."""
         self.goal = self.variations[variation]
-        names = list(self.objects)
-        self.slots = [names[i] for i in rng.permutation(len(names))]
+        self.grasps = Grasps()
         self.place(simulation, rng)
-        others = [color for color in COLORS if color not in self.goal]
-        drawn = rng.choice(len(others), len(self.distractors), replace=False)
-        for slot, color in zip(self.slots, [*self.goal, *(others[i] for i in drawn)], strict=True):
-            simulation.paint(slot, COLORS[color])
-
-    @property
-    def targets(self) -> list[str]:
-        """Objects that the instruction names, in order."""
-        return self.slots[: len(self.goal)]
-
-    @property
-    def distractors(self) -> list[str]:
-        """Objects that the instruction does not name."""
-        return self.slots[len(self.goal) :]
 
     @abstractmethod
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
@@ -90,15 +65,44 @@ class Task(ABC):
         """Macro steps of the expert, via points included."""
 
     @classmethod
-    @abstractmethod
     def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
         """Paraphrases of a variation's instruction; ``split`` is ``train`` or ``held_out``."""
+        return tuple(template.format(*cls.variations[variation]) for template in cls.templates[split])
 
 
-def scatter(rng: np.random.Generator, count: int, apart: float) -> Float[np.ndarray, "count 2"]:
-    """Uniform positions [m] in ``WORKSPACE``, at least ``apart`` from one another."""
+class Grasps:
+    """What the gripper has closed on since the episode began."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self.held: set[str] = set()
+
+    def watch(self, simulation: "Simulation", gripper: float, objects: Collection[str]) -> None:
+        """Note which of ``objects`` (or parts, "cabinet/top") are between the finger pads."""
+        if gripper < 0.5:
+            self.closed = True
+            self.held |= {name for name in objects if simulation.gripped(name)}
+
+    def failure(self, wanted: Collection[str]) -> str:
+        """Anything else held; something wanted held, but the task not finished; closed on nothing; never closed."""
+        if self.held - set(wanted):
+            return "wrong object"
+        if self.held:
+            return "time"
+        return "grasp missed" if self.closed else "not reached"
+
+
+def scatter(
+    rng: np.random.Generator, count: int, apart: float, area: Float[np.ndarray, "2 2"] = WORKSPACE
+) -> Float[np.ndarray, "count 2"]:
+    """Uniform positions [m] in ``area`` (ranges of x and y), at least ``apart`` from one another."""
     while True:
-        points = rng.uniform(WORKSPACE[:, 0], WORKSPACE[:, 1], (count, 2))
+        points = rng.uniform(area[:, 0], area[:, 1], (count, 2))
         distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
-        if distances[np.triu_indices(count, 1)].min() >= apart:
+        if distances[np.triu_indices(count, 1)].min(initial=np.inf) >= apart:
             return points
+
+
+def nearest_turn(yaw: float, period: float) -> float:
+    """The angle [rad] nearest to 0 that differs from ``yaw`` by whole periods: a symmetric object's easiest grasp."""
+    return float((yaw + period / 2) % period - period / 2)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion, Pose, top_down
-from lerobot_histmv.envs.tasks.base import COLORS, Task, scatter
+from lerobot_histmv.envs.tasks.base import nearest_turn, scatter
+from lerobot_histmv.envs.tasks.colors import COLORS, ColorTask
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -22,42 +23,37 @@ ABOVE = 0.14
 CARRY = (0.28, 0.0, 0.30)
 """Where the expert brings the cube [m]: in front of the robot."""
 
-TEMPLATES = {
-    "train": (
-        "pick up the {} cube and lift it",
-        "lift the {} cube",
-        "grasp the {} block and raise it",
-        "take the {} cube and hold it up",
-        "grab the {} block and lift it up",
-        "raise the {} cube off the table",
-    ),
-    "held_out": (
-        "hoist the {} block",
-        "get hold of the {} cube and bring it up",
-        "the {} cube should go up in the air",
-    ),
-}
 
-
-class PickAndLift(Task):
+class PickAndLift(ColorTask):
     """After RLBench's ``pick_and_lift``. Success: both finger pads touch the target and its centre is above 0.2 m."""
 
     name = "pick_and_lift"
     objects: ClassVar[Mapping[str, str]] = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}
     variations = tuple((color,) for color in COLORS)
+    templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            "pick up the {} cube and lift it",
+            "lift the {} cube",
+            "grasp the {} block and raise it",
+            "take the {} cube and hold it up",
+            "grab the {} block and lift it up",
+            "raise the {} cube off the table",
+        ),
+        "held_out": (
+            "hoist the {} block",
+            "get hold of the {} cube and bring it up",
+            "the {} cube should go up in the air",
+        ),
+    }
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Cubes at least 10 cm apart, turned by any angle."""
         for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
             simulation.place_free(name, (x, y, CUBE_HEIGHT), rng.uniform(-np.pi, np.pi))
-        self._closed = self._gripped_target = self._gripped_other = False
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Remember what has been grasped."""
-        if gripper < 0.5:
-            self._closed = True
-            self._gripped_target |= simulation.gripped(self.targets[0])
-            self._gripped_other |= any(simulation.gripped(name) for name in self.distractors)
+        self.grasps.watch(simulation, gripper, self.slots)
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Grasped and lifted."""
@@ -66,16 +62,12 @@ class PickAndLift(Task):
 
     def failure(self) -> str:
         """Wrong cube grasped; never closed; closed beside the cube; else held but not lifted in time."""
-        if self._gripped_other:
-            return "wrong object"
-        if self._gripped_target:
-            return "time"
-        return "grasp missed" if self._closed else "not reached"
+        return self.grasps.failure(self.targets)
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Down over the cube, grasp, up and back towards the robot."""
         cube = self.targets[0]
-        grasp = top_down(simulation.position(cube), _nearest_quarter_turn(simulation.yaw(cube)))
+        grasp = top_down(simulation.position(cube), nearest_turn(simulation.yaw(cube), np.pi / 2))
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
         carry = Pose(np.array(CARRY), grasp.quaternion)
         yield Motion(via=(grasp.raised(ABOVE),), target=carry, gripper=0.0, dwell=4)
@@ -84,13 +76,3 @@ class PickAndLift(Task):
     def macro_steps(cls, variation: int) -> int:
         """Above, grasp, above, carry."""
         return 4
-
-    @classmethod
-    def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
-        """Paraphrases of "pick up the <colour> cube and lift it"."""
-        return tuple(template.format(*cls.variations[variation]) for template in TEMPLATES[split])
-
-
-def _nearest_quarter_turn(yaw: float) -> float:
-    """The equivalent grasp of a cube, turned by less than 45 degrees from the tool's home orientation [rad]."""
-    return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)

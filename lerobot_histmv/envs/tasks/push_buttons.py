@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion, top_down
-from lerobot_histmv.envs.tasks.base import Task, scatter
+from lerobot_histmv.envs.tasks.base import scatter
+from lerobot_histmv.envs.tasks.colors import ColorTask
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -40,7 +41,7 @@ TEMPLATES = {
 """How a sentence begins, and how each further button is added to it."""
 
 
-class PushButtons(Task):
+class PushButtons(ColorTask):
     """After RLBench's ``push_buttons``. Success: the named buttons were pressed in the named order, and no other.
 
     The arm starts with its gripper closed, which is its pushing tool. A pressed button springs back and looks as
@@ -80,7 +81,7 @@ class PushButtons(Task):
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Note each press; pressing the same button again changes nothing."""
         for name in self.slots:
-            if simulation.slide(name) < PRESSED and self._pressed[-1:] != [name]:
+            if simulation.joint(name) < PRESSED and self._pressed[-1:] != [name]:
                 self._pressed.append(name)
 
     def is_success(self, simulation: "Simulation") -> bool:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion, top_down
-from lerobot_histmv.envs.tasks.base import COLORS, Task, scatter
+from lerobot_histmv.envs.tasks.base import scatter
+from lerobot_histmv.envs.tasks.colors import COLORS, ColorTask
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -20,25 +21,24 @@ REACHED = 0.02
 ABOVE = 0.10
 """Height [m] of the via point over the target."""
 
-TEMPLATES = {
-    "train": (
-        "reach the {} target",
-        "touch the {} ball",
-        "move to the {} sphere",
-        "bring the gripper to the {} ball",
-        "go to the {} target",
-        "put the fingertips at the {} sphere",
-    ),
-    "held_out": ("head for the {} ball", "the {} sphere is where the gripper should be", "approach the {} target"),
-}
 
-
-class ReachTarget(Task):
+class ReachTarget(ColorTask):
     """After RLBench's ``reach_target``. Success: the tool is within 2 cm of the target's centre when a step ends."""
 
     name = "reach_target"
     objects: ClassVar[Mapping[str, str]] = {"sphere0": "sphere", "sphere1": "sphere", "sphere2": "sphere"}
     variations = tuple((color,) for color in COLORS)
+    templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            "reach the {} target",
+            "touch the {} ball",
+            "move to the {} sphere",
+            "bring the gripper to the {} ball",
+            "go to the {} target",
+            "put the fingertips at the {} sphere",
+        ),
+        "held_out": ("head for the {} ball", "the {} sphere is where the gripper should be", "approach the {} target"),
+    }
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Spheres at least 12 cm apart on the ground plan, 5 to 20 cm above the table."""
@@ -70,8 +70,3 @@ class ReachTarget(Task):
     def macro_steps(cls, variation: int) -> int:
         """Above and down."""
         return 2
-
-    @classmethod
-    def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
-        """Paraphrases of "reach the <colour> target"."""
-        return tuple(template.format(*cls.variations[variation]) for template in TEMPLATES[split])
