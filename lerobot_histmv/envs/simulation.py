@@ -117,8 +117,10 @@ class Simulation:
         return float(self.data.joint(_full(name, "joint")).qpos[0])
 
     def place_free(self, name: str, position: Point, yaw: float) -> None:
-        """Put an object that has a free joint somewhere."""
-        self.data.joint(_full(name, "joint")).qpos[:] = [*position, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        """Put an object that has a free joint somewhere, at rest."""
+        joint = self.data.joint(_full(name, "joint"))
+        joint.qpos[:] = [*position, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        joint.qvel[:] = 0
 
     def place_fixed(self, name: str, position: Point, yaw: float = 0.0) -> None:
         """Put an object that is fixed to the world somewhere."""

@@ -1,0 +1,99 @@
+"""Hang a picture frame on a hook."""
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from lerobot_histmv.envs.motion import Motion
+from lerobot_histmv.envs.tasks.base import Task
+
+if TYPE_CHECKING:
+    from lerobot_histmv.envs.simulation import Simulation
+
+HOOK_AREA = np.array([[0.48, 0.56], [-0.1, 0.1]])
+"""Range of x and y [m] of the hook's board."""
+STAND_AREA = np.array([[0.3, 0.36], [-0.2, 0.2]])
+"""Range of x and y [m] of the frame in its stand."""
+MAX_YAW = np.pi / 8
+STANDING = 0.0641
+"""Height [m] of the standing frame's centre."""
+HANGING = -0.044
+"""Height [m] of a hanging frame's centre over the hook's seat."""
+TOLERANCE = (0.025, 0.03, 0.012)
+"""A frame hangs when its centre is this close to the place below the seat, in the board's frame [m]."""
+CLEAR = 0.03
+"""Height [m] at which the frame passes over the hook's tip."""
+BEFORE = 0.08
+"""Distance [m] in front of the hook at which the frame waits."""
+ABOVE = 0.12
+
+
+class HangFrameOnHanger(Task):
+    """After RLBench's ``hang_frame_on_hanger``.
+
+    | | |
+    |---|---|
+    | objects | a frame in a stand, a board with a hook |
+    | scene | board at x 0.48 to 0.56, y -0.1 to 0.1 m; stand at x 0.30 to 0.36, y -0.2 to 0.2 m; each turned by up to 22 degrees |
+    | variations | one |
+    | success | the frame hangs on the hook and is not held |
+    | failure | grasp missed: the gripper closed beside the frame's tab |
+    | macro steps | 6: above, grasp, up, before the hook, over it, down |
+    | difficulty | the rail goes over the hook's raised tip, then down by its length |
+    """
+
+    name = "hang_frame_on_hanger"
+    objects: ClassVar[Mapping[str, str]] = {"hook": "wall_hook", "stand": "frame_stand", "frame": "frame"}
+    variations = ((),)
+    templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            "hang the frame on the hanger",
+            "hang the picture frame on the hook",
+            "put the frame onto the red hook",
+            "take the frame out of its stand and hang it up",
+            "hang up the frame",
+            "place the picture on the hanger",
+        ),
+        "held_out": ("the picture should hang on the board", "mount the frame on the hook", "hook the frame on"),
+    }
+
+    def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
+        """The board at the back, the frame in its stand in front."""
+        x, y = rng.uniform(*HOOK_AREA.T)
+        simulation.place_fixed("hook", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+        (x, y), yaw = rng.uniform(*STAND_AREA.T), rng.uniform(-MAX_YAW, MAX_YAW)
+        simulation.place_fixed("stand", (x, y, 0), yaw)
+        simulation.place_free("frame", (x, y, STANDING), yaw)
+
+    def watch(self, simulation: "Simulation", gripper: float) -> None:
+        """Remember whether the frame was grasped."""
+        self.grasps.watch(simulation, gripper, ["frame"])
+
+    def is_success(self, simulation: "Simulation") -> bool:
+        """At the hook, let go."""
+        place = simulation.site("hook/seat").position + np.array([0, 0, HANGING])
+        offset = simulation.rotation("hook").T @ (simulation.position("frame") - place)
+        return bool((np.abs(offset) < TOLERANCE).all()) and not simulation.gripped("frame")
+
+    def failure(self) -> str:
+        """Whether the frame was grasped."""
+        return self.grasps.failure(["frame"])
+
+    def expert(self, simulation: "Simulation") -> Iterator[Motion]:
+        """By the tab, around the stand's walls, over the hook's tip, down."""
+        grasp = simulation.site("frame")
+        yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
+        frame = simulation.position("frame")
+        turned = simulation.tool_pose().turned(
+            (0, 0, 1), simulation.yaw("hook") - simulation.yaw("frame"), pivot=frame
+        )
+        hung = turned.moved(simulation.site("hook/seat").position + np.array([0, 0, HANGING]) - frame)
+        over = hung.raised(CLEAR)
+        before = over.moved(-BEFORE * simulation.rotation("hook")[:, 0])
+        yield Motion(via=(grasp.raised(ABOVE), before, over), target=hung, gripper=1.0, dwell=4)
+
+    @classmethod
+    def macro_steps(cls, variation: int) -> int:
+        """Above, grasp, up, before, over, down."""
+        return 6

@@ -1,0 +1,97 @@
+"""Move a clothes hanger from one rack to another."""
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from lerobot_histmv.envs.motion import Motion
+from lerobot_histmv.envs.tasks.base import Task
+
+if TYPE_CHECKING:
+    from lerobot_histmv.envs.simulation import Simulation
+
+RACKS = ("left_rack", "right_rack")
+CENTRES = {"left_rack": (0.42, 0.17), "right_rack": (0.42, -0.13)}
+"""Middle [m] of each rack's range of places."""
+SPREAD = (0.07, 0.04)
+"""How far [m] a rack may lie from there."""
+MAX_YAW = np.pi / 9
+HANGS = 0.0005
+"""Height [m] of a hanging hanger's origin over the rod's axis ..."""
+TOLERANCE = (0.025, 0.05, 0.012)
+"""... and how close [m] to the seat, in the rack's frame, counts as on the rack."""
+ABOVE = 0.1
+
+
+class MoveHanger(Task):
+    """After RLBench's ``move_hanger``.
+
+    | | |
+    |---|---|
+    | objects | two racks, a clothes hanger on one of them |
+    | scene | racks at x 0.35 to 0.49, y 0.13 to 0.21 and -0.17 to -0.09 m, turned by up to 20 degrees |
+    | variations | one |
+    | success | the hanger is on the other rack and not held |
+    | failure | grasp missed: the gripper closed beside the hanger's tab |
+    | macro steps | 5: above, grasp, up, over the other rod, down |
+    | difficulty | 1 cm of play over the rod; the place to go is where the hanger was not |
+    """
+
+    name = "move_hanger"
+    objects: ClassVar[Mapping[str, str]] = dict.fromkeys(RACKS, "rack") | {"hanger": "coat_hanger"}
+    variations = ((),)
+    templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            "move the hanger to the other rack",
+            "move the hanger onto the other rod",
+            "take the clothes hanger and hang it on the other rack",
+            "hang the hanger on the empty rack",
+            "bring the clothes hanger to the free rod",
+            "put the hanger on the other side",
+        ),
+        "held_out": (
+            "the hanger belongs on the empty rod",
+            "transfer the hanger between the racks",
+            "the other rack should hold the hanger",
+        ),
+    }
+
+    def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
+        """Racks left and right, the hanger on either."""
+        for rack in RACKS:
+            place = CENTRES[rack] + rng.uniform(-1, 1, 2) * SPREAD
+            simulation.place_fixed(rack, (*place, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+        self._start, self._goal = (RACKS[i] for i in rng.permutation(2))
+        simulation.refresh()
+        seat = simulation.site(f"{self._start}/seat").position
+        simulation.place_free("hanger", seat + np.array([0, 0, HANGS]), simulation.yaw(self._start))
+
+    def watch(self, simulation: "Simulation", gripper: float) -> None:
+        """Remember whether the hanger was grasped."""
+        self.grasps.watch(simulation, gripper, ["hanger"])
+
+    def is_success(self, simulation: "Simulation") -> bool:
+        """On the other rod, let go."""
+        seat = simulation.site(f"{self._goal}/seat").position
+        offset = simulation.rotation(self._goal).T @ (simulation.position("hanger") - seat)
+        return bool((np.abs(offset) < TOLERANCE).all()) and not simulation.gripped("hanger")
+
+    def failure(self) -> str:
+        """Whether the hanger was grasped."""
+        return self.grasps.failure(["hanger"])
+
+    def expert(self, simulation: "Simulation") -> Iterator[Motion]:
+        """By the tab, up, over the other rod, down."""
+        grasp = simulation.site("hanger")
+        yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
+        hanger = simulation.position("hanger")
+        turn = simulation.yaw(self._goal) - simulation.yaw("hanger")
+        turned = simulation.tool_pose().turned((0, 0, 1), turn, pivot=hanger)
+        hung = turned.moved(simulation.site(f"{self._goal}/seat").position + np.array([0, 0, HANGS]) - hanger)
+        yield Motion(via=(grasp.raised(ABOVE), hung.raised(ABOVE)), target=hung, gripper=1.0, dwell=4)
+
+    @classmethod
+    def macro_steps(cls, variation: int) -> int:
+        """Above, grasp, up, over, down."""
+        return 5

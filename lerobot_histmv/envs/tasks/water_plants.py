@@ -1,0 +1,104 @@
+"""Water a plant with a watering can."""
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from lerobot_histmv.envs.motion import Motion
+from lerobot_histmv.envs.tasks.base import Task, scatter
+
+if TYPE_CHECKING:
+    from lerobot_histmv.envs.simulation import Simulation
+
+DROPS = tuple(f"drop{i}" for i in range(5))
+APART = 0.2
+"""Least distance between plant and can [m]."""
+CAN_YAW = np.pi / 6
+"""The spout points to the plant, give or take this angle [rad]."""
+POURS = np.cos(np.radians(45))
+"""Water leaves the spout once the can's axis is tilted by 45 degrees."""
+TILT = np.radians(62)
+"""How far the expert tilts the can [rad]."""
+POT_RADIUS, POT_HEIGHT = 0.05, 0.07
+SPOUT_HEIGHT = 0.11
+"""Height [m] of the spout over the table while the expert pours."""
+ABOVE = 0.14
+UNDER_THE_TABLE = -0.745
+"""Height [m] of the drops on the floor before they are poured."""
+
+
+class WaterPlants(Task):
+    """After RLBench's ``water_plants``.
+
+    | | |
+    |---|---|
+    | objects | a watering can, a plant in a pot, five drops that come into being at the spout |
+    | scene | can at x 0.32 to 0.50, plant at x 0.38 to 0.52, y -0.24 to 0.24 m, at least 20 cm apart; the spout points to the |
+    | | plant within 30 degrees |
+    | variations | one |
+    | success | five drops are in the pot; a can tilted by more than 45 degrees loses one every 50 ms |
+    | failure | time: the can was held, but the pot is not watered |
+    | macro steps | 6: above, grasp, up, spout over the pot, tilt, upright |
+    | difficulty | a tilt of 62 degrees with the spout kept in place; five drops cannot be poured twice |
+    """
+
+    name = "water_plants"
+    objects: ClassVar[Mapping[str, str]] = {"can": "watering_can", "plant": "plant"} | dict.fromkeys(DROPS, "drop")
+    variations = ((),)
+    templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            "water the plant",
+            "pour water on the plant",
+            "use the watering can to water the plant",
+            "pick up the watering can and water the plant",
+            "give the plant some water",
+            "empty the can into the flower pot",
+        ),
+        "held_out": ("the plant is thirsty", "the flower needs water", "sprinkle the plant in the pot"),
+    }
+
+    def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
+        """Can and plant anywhere, the spout more or less towards the plant; no drop in sight."""
+        while True:
+            plant, can = rng.uniform([[0.38, -0.24], [0.32, -0.24]], [[0.52, 0.24], [0.5, 0.24]])
+            if np.linalg.norm(plant - can) > APART:
+                break
+        simulation.place_fixed("plant", (*plant, 0))
+        towards = np.arctan2(*(plant - can)[::-1])
+        simulation.place_free("can", (*can, 0.0005), towards + rng.uniform(-CAN_YAW, CAN_YAW))
+        for i, drop in enumerate(DROPS):
+            simulation.place_free(drop, (0.3 + 0.05 * i, 0, UNDER_THE_TABLE), 0)
+        self._poured = 0
+
+    def watch(self, simulation: "Simulation", gripper: float) -> None:
+        """Remember whether the can was held; pour when it is tilted."""
+        self.grasps.watch(simulation, gripper, ["can"])
+        if self._poured < len(DROPS) and simulation.rotation("can")[2, 2] < POURS:
+            simulation.place_free(DROPS[self._poured], simulation.site("can/spout").position, 0)
+            self._poured += 1
+
+    def is_success(self, simulation: "Simulation") -> bool:
+        """All drops in the pot."""
+        offsets = [simulation.position(drop) - simulation.position("plant") for drop in DROPS]
+        return all(np.hypot(x, y) < POT_RADIUS and 0 < z < POT_HEIGHT for x, y, z in offsets)
+
+    def failure(self) -> str:
+        """Whether the can was held."""
+        return self.grasps.failure(["can"])
+
+    def expert(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Take the can by its handle, bring the spout over the pot, tilt about the spout, and back."""
+        grasp = simulation.site("can/grasp")
+        yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
+        tool, spout = simulation.tool_pose(), simulation.site("can/spout").position
+        goal = simulation.position("plant") + np.array([0, 0, SPOUT_HEIGHT])
+        upright = tool.moved(goal - spout)
+        tilted = upright.turned(simulation.rotation("can")[:, 1], TILT, pivot=goal)
+        yield Motion(via=(tool.raised(ABOVE), upright), target=tilted, gripper=0.0, dwell=4)
+        yield Motion(via=(), target=upright, gripper=0.0, dwell=4)
+
+    @classmethod
+    def macro_steps(cls, variation: int) -> int:
+        """Above, grasp, up, over the pot, tilt, upright."""
+        return 6
