@@ -21,6 +21,12 @@ HANGS = 0.0005
 """Height [m] of a hanging hanger's origin over the rod's axis ..."""
 TOLERANCE = (0.025, 0.05, 0.012)
 """... and how close [m] to the seat, in the rack's frame, counts as on the rack."""
+LIFT = 0.027
+"""Height [m] at which the rod passes through the hook's opening."""
+OUT = 0.07
+"""How far [m] the hanger then moves away from the robot to be free of the rod."""
+UP = 0.13
+"""Height [m] over that at which it crosses to the other rack."""
 ABOVE = 0.1
 
 
@@ -34,8 +40,8 @@ class MoveHanger(Task):
     | variations | one |
     | success | the hanger is on the other rack and not held |
     | failure | grasp missed: the gripper closed beside the hanger's tab |
-    | macro steps | 5: above, grasp, up, over the other rod, down |
-    | difficulty | 1 cm of play over the rod; the place to go is where the hanger was not |
+    | macro steps | 9: above, grasp, lift, out, up, across, beside the other rod, over it, down |
+    | difficulty | the hook opens towards the robot only; the place to go is where the hanger was not |
     """
 
     name = "move_hanger"
@@ -82,16 +88,21 @@ class MoveHanger(Task):
         return self.grasps.failure(["hanger"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
-        """By the tab, up, over the other rod, down."""
+        """Free the hook by lifting and moving it away from the robot; at the other rack the same way back."""
         grasp = simulation.site("hanger")
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
-        hanger = simulation.position("hanger")
-        turn = simulation.yaw(self._goal) - simulation.yaw("hanger")
-        turned = simulation.tool_pose().turned((0, 0, 1), turn, pivot=hanger)
-        hung = turned.moved(simulation.site(f"{self._goal}/seat").position + np.array([0, 0, HANGS]) - hanger)
-        yield Motion(via=(grasp.raised(ABOVE), hung.raised(ABOVE)), target=hung, gripper=1.0, dwell=4)
+        held, hanger = simulation.tool_pose(), simulation.position("hanger")
+        lifted = held.raised(LIFT)
+        out = lifted.moved(OUT * simulation.rotation(self._start)[:, 0])
+        yield Motion(via=(lifted, out), target=out.raised(UP), gripper=0.0)
+        turn = simulation.yaw(self._goal) - simulation.yaw(self._start)
+        seat = simulation.site(f"{self._goal}/seat").position + np.array([0, 0, HANGS])
+        hung = held.turned((0, 0, 1), turn, pivot=hanger).moved(seat - hanger)
+        over = hung.raised(LIFT)
+        beside = over.moved(OUT * simulation.rotation(self._goal)[:, 0])
+        yield Motion(via=(beside.raised(UP), beside, over), target=hung, gripper=1.0, dwell=4)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:
-        """Above, grasp, up, over, down."""
-        return 5
+        """Above, grasp, lift, out, up, across, beside the other rod, over it, down."""
+        return 9
