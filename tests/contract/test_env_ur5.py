@@ -94,24 +94,43 @@ def test_the_same_seed_gives_the_same_episode_in_fresh_and_used_environments(env
         assert first[1:] == second[1:]
 
 
-def test_different_seeds_give_different_scenes(env: UR5Env) -> None:
-    places = set()
+def places(env: UR5Env) -> dict[str, tuple[float, ...]]:
+    """Where the scene's objects are [m]."""
+    simulation = env.stage.simulation
+    return {name: tuple(np.round(simulation.position(name), 3).tolist()) for name in env.stage.task.objects}
+
+
+def test_different_seeds_give_different_scenes_that_are_not_solved(env: UR5Env) -> None:
+    scenes = set()
     for seed in range(5):
         env.reset(seed=seed)
-        places.add(tuple(np.round(env.stage.simulation.position(env.stage.task.targets[0]), 3)))
-    assert len(places) == 5
+        assert not env.is_success()
+        scenes.add(tuple(places(env).values()))
+    assert len(scenes) == 5
 
 
-def test_objects_lie_apart_in_the_documented_area(env: UR5Env) -> None:
-    for seed in range(11):
+def test_objects_rest_where_they_were_put(env: UR5Env) -> None:
+    for seed in range(3):
         env.reset(seed=seed)
-        task = env.stage.task
-        places = np.array([env.stage.simulation.position(name)[:2] for name in task.slots])
-        assert (places >= [0.299, -0.281]).all()
-        assert (places <= [0.601, 0.281]).all()
-        assert min(np.linalg.norm(places[i] - places[j]) for i in range(3) for j in range(i)) >= 0.0999
-        paints = [tuple(env.stage.simulation.model.geom(f"{name}_paint").rgba) for name in task.slots]
-        assert len(set(paints)) == 3
+        before = places(env)
+        env.stage.controller.hold(11)
+        for name, place in places(env).items():
+            np.testing.assert_allclose(place, before[name], atol=0.003, err_msg=f"{name} moves by itself")
+
+
+def test_objects_named_by_colour_lie_apart_in_the_documented_area() -> None:
+    for name in ("reach_target", "push_buttons", "pick_and_lift", "pick_up_cup", "stack_cups"):
+        env = tiny(name)
+        for seed in range(11):
+            env.reset(seed=seed)
+            slots = env.stage.task.slots
+            where = np.array([env.stage.simulation.position(slot)[:2] for slot in slots])
+            assert (where >= [0.299, -0.281]).all()
+            assert (where <= [0.601, 0.281]).all()
+            assert min(np.linalg.norm(where[i] - where[j]) for i in range(3) for j in range(i)) >= 0.0999
+            paints = [tuple(env.stage.simulation.model.material(f"{slot}_paint").rgba) for slot in slots]
+            assert len(set(paints)) == 3
+        env.close()
 
 
 def test_fixing_the_variation_leaves_the_places(env: UR5Env) -> None:
@@ -121,7 +140,7 @@ def test_fixing_the_variation_leaves_the_places(env: UR5Env) -> None:
         _, info = env.reset(seed=7, options={"variation": variation})
         assert info["variation"] == variation
         assert info["instruction"] in TASKS[env.task].instructions(variation, "train")
-        scenes.append({name: tuple(env.stage.simulation.position(name)) for name in env.stage.task.objects})
+        scenes.append(places(env))
     assert scenes[0] == scenes[1]
 
 
@@ -130,7 +149,7 @@ def test_the_documented_start_is_true(env: UR5Env) -> None:
     state = observation["agent_pos"]
     np.testing.assert_allclose(state[:3], [0.28, 0, 0.40], atol=0.002)
     np.testing.assert_allclose(state[3:7], [1, 0, 0, 0], atol=1e-3)
-    assert state[7] == pytest.approx(0 if env.task == "push_buttons" else 1, abs=0.05)
+    assert state[7] == pytest.approx(TASKS[env.task].initial_gripper, abs=0.05)
     assert info | {"is_success": False, "failure": "", "ticks": 0} == info
     assert env.observation_space.contains(observation)
 
@@ -208,7 +227,7 @@ def test_wild_actions_break_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "juggle"}, "accepted are reach_target, push_buttons, pick_and_lift"),
+        ({"task": "juggle"}, "accepted are reach_target, push_buttons, pick_and_lift, "),
         ({"task": "pick_and_lift", "cameras": ("front", "back")}, "front, left_shoulder, wrist"),
         ({"task": "pick_and_lift", "cameras": ()}, "different names"),
         ({"task": "pick_and_lift", "control": "torque"}, "macro, servo"),

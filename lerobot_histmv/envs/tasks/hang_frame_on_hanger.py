@@ -50,7 +50,7 @@ class HangFrameOnHanger(Task):
         "train": (
             "hang the frame on the hanger",
             "hang the picture frame on the hook",
-            "put the frame onto the red hook",
+            "put the frame onto the hook",
             "take the frame out of its stand and hang it up",
             "hang up the frame",
             "place the picture on the hanger",

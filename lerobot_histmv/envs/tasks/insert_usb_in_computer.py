@@ -55,7 +55,7 @@ class InsertUsbInComputer(Task):
             "connect the usb stick to the computer",
             "push the usb stick into the slot",
         ),
-        "held_out": ("the computer needs the usb stick", "attach the memory stick", "the stick goes into the blue port"),
+        "held_out": ("the computer needs the usb stick", "attach the memory stick", "the stick goes into the port"),
     }
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:

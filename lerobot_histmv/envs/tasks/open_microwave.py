@@ -45,7 +45,7 @@ class OpenMicrowave(Task):
             "open the microwave",
             "pull the microwave's door open",
             "open the door of the microwave",
-            "grasp the red bar and open the microwave",
+            "grasp the bar and open the microwave",
             "swing the microwave door open",
             "open up the microwave oven",
         ),

@@ -29,7 +29,7 @@ class PutItemInDrawer(Drawers):
 
     | | |
     |---|---|
-    | objects | a cabinet with three drawers, an orange item on its top |
+    | objects | a cabinet with three drawers, a block on its top |
     | scene | as in open_drawer; the item anywhere on the middle of the top, any yaw |
     | variations | bottom, middle, top |
     | success | the item is inside the named drawer and not held |
@@ -45,7 +45,7 @@ class PutItemInDrawer(Drawers):
             "put the item in the {} drawer",
             "place the block in the {} drawer",
             "open the {} drawer and put the item inside",
-            "store the orange block in the {} drawer",
+            "store the block in the {} drawer",
             "move the item from the cabinet's top into the {} drawer",
             "leave the block in the {} drawer",
         ),
