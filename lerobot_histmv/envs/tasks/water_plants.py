@@ -39,7 +39,7 @@ class WaterPlants(Task):
     | variations | one |
     | success | five drops are in the pot; a can tilted by more than 45 degrees loses one every 50 ms |
     | failure | time: the can was held, but the pot is not watered |
-    | macro steps | 6: above, grasp, up, spout over the pot, tilt, upright |
+    | macro steps | 6: above, grasp, up, spout over the pot, half the tilt, the whole tilt |
     | difficulty | a tilt of 62 degrees with the spout kept in place; five drops cannot be poured twice |
     """
 
@@ -88,17 +88,17 @@ class WaterPlants(Task):
         return self.grasps.failure(["can"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
-        """Take the can by its handle, bring the spout over the pot, tilt about the spout, and back."""
+        """Take the can by its handle, bring the spout over the pot, tilt about the spout."""
         grasp = simulation.site("can/grasp")
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
         tool, spout = simulation.tool_pose(), simulation.site("can/spout").position
         goal = simulation.position("plant") + np.array([0, 0, SPOUT_HEIGHT])
         upright = tool.moved(goal - spout)
-        tilted = upright.turned(simulation.rotation("can")[:, 1], TILT, pivot=goal)
-        yield Motion(via=(tool.raised(ABOVE), upright), target=tilted, gripper=0.0, dwell=4)
-        yield Motion(via=(), target=upright, gripper=0.0, dwell=4)
+        across = simulation.rotation("can")[:, 1]
+        half, tilted = (upright.turned(across, share * TILT, pivot=goal) for share in (0.5, 1))
+        yield Motion(via=(tool.raised(ABOVE), upright, half), target=tilted, gripper=0.0, dwell=8)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:
-        """Above, grasp, up, over the pot, tilt, upright."""
+        """Above, grasp, up, over the pot, half the tilt, the whole tilt."""
         return 6
