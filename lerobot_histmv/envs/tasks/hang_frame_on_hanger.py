@@ -35,7 +35,8 @@ class HangFrameOnHanger(Task):
     | | |
     |---|---|
     | objects | a frame in a stand, a board with a hook |
-    | scene | board at x 0.48 to 0.56, y -0.1 to 0.1 m; stand at x 0.30 to 0.36, y -0.2 to 0.2 m; each turned by up to 22 degrees |
+    | scene | board at x 0.48 to 0.56, y -0.1 to 0.1 m; stand at x 0.30 to 0.36, y -0.2 to 0.2 m; |
+    | | each turned by up to 22 degrees |
     | variations | one |
     | success | the frame hangs on the hook and is not held |
     | failure | grasp missed: the gripper closed beside the frame's tab |
@@ -85,9 +86,7 @@ class HangFrameOnHanger(Task):
         grasp = simulation.site("frame")
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
         frame = simulation.position("frame")
-        turned = simulation.tool_pose().turned(
-            (0, 0, 1), simulation.yaw("hook") - simulation.yaw("frame"), pivot=frame
-        )
+        turned = simulation.tool_pose().turned((0, 0, 1), simulation.yaw("hook") - simulation.yaw("frame"), pivot=frame)
         hung = turned.moved(simulation.site("hook/seat").position + np.array([0, 0, HANGING]) - frame)
         over = hung.raised(CLEAR)
         before = over.moved(-BEFORE * simulation.rotation("hook")[:, 0])

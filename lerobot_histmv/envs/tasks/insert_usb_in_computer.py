@@ -35,7 +35,8 @@ class InsertUsbInComputer(Task):
     | | |
     |---|---|
     | objects | a computer with one port in its front, a stick on a pedestal |
-    | scene | front at x 0.46 to 0.54, y -0.12 to 0.12 m; stick at x 0.29 to 0.36, y -0.22 to 0.22 m; each turned by up to 22 degrees |
+    | scene | front at x 0.46 to 0.54, y -0.12 to 0.12 m; stick at x 0.29 to 0.36, y -0.22 to 0.22 m; |
+    | | each turned by up to 22 degrees |
     | variations | one |
     | success | the plug's tip is at least 7 mm inside the port |
     | failure | grasp missed: the gripper closed beside the stick |

@@ -19,7 +19,7 @@ PULL = 0.16
 """How far the expert pulls [m]."""
 APPROACH = 0.10
 """Distance [m] of the via point in front of a handle."""
-AREA = np.array([[0.4, 0.5], [-0.12, -0.02]])
+AREA = np.array([[0.4, 0.5], [-0.07, 0.03]])
 """Range of x and y [m] of the middle of the cabinet's front."""
 FACING = -np.pi / 2
 """Yaw [rad] of the cabinet in the middle of its range: drawers come out to the left (+y), where a camera sees them and
@@ -56,7 +56,7 @@ class OpenDrawer(Drawers):
     | | |
     |---|---|
     | objects | a cabinet with three drawers |
-    | scene | front at x 0.40 to 0.50, y -0.12 to -0.02 m, facing left, turned by up to 22 degrees |
+    | scene | front at x 0.40 to 0.50, y -0.07 to 0.03 m, facing left, turned by up to 22 degrees |
     | variations | bottom, middle, top |
     | success | the named drawer is more than 15 cm out |
     | failure | wrong object: another handle was grasped |

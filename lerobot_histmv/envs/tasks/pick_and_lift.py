@@ -25,7 +25,18 @@ CARRY = (0.28, 0.0, 0.30)
 
 
 class PickAndLift(ColorTask):
-    """After RLBench's ``pick_and_lift``. Success: both finger pads touch the target and its centre is above 0.2 m."""
+    """After RLBench's ``pick_and_lift``.
+
+    | | |
+    |---|---|
+    | objects | three cubes of 4 cm and 50 g |
+    | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 10 cm apart, any yaw |
+    | variations | six colours |
+    | success | the named cube is held and its centre is above 0.2 m (RLBench: held, inside a ball that is shown) |
+    | failure | wrong object: another cube was held |
+    | macro steps | 4: above, grasp, above, carry |
+    | difficulty | none beyond finding the cube: 1 cm aside is still a grasp |
+    """
 
     name = "pick_and_lift"
     objects: ClassVar[Mapping[str, str]] = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}

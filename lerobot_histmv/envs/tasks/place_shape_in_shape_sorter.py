@@ -39,7 +39,8 @@ class PlaceShapeInShapeSorter(Task):
     |---|---|
     | objects | a box with five holes in its lid, five shapes |
     | scene | box at x 0.47 to 0.55, y -0.06 to 0.06 m, turned by up to 20 degrees; shapes at x 0.28 to 0.39, any yaw |
-    | variations | cube, cylinder, triangle, hexagon, cross (RLBench: star and moon instead of the last two, outlines that boards do not leave open) |
+    | variations | cube, cylinder, triangle, hexagon, cross (RLBench: star and moon for the last two, whose |
+    | | outlines straight boards do not leave open) |
     | success | the named shape is inside the box |
     | failure | wrong object: another shape was held |
     | macro steps | 5: above, grasp, up, over the hole, into it |

@@ -42,10 +42,21 @@ TEMPLATES = {
 
 
 class PushButtons(ColorTask):
-    """After RLBench's ``push_buttons``. Success: the named buttons were pressed in the named order, and no other.
+    """After RLBench's ``push_buttons``.
 
-    The arm starts with its gripper closed, which is its pushing tool. A pressed button springs back and looks as
-    before.
+    | | |
+    |---|---|
+    | objects | three buttons whose caps spring back: a pressed one looks as before (RLBench's change colour) |
+    | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 14 cm apart |
+    | variations | 18: six single colours (0 to 5), six pairs (6 to 11), six triples (12 to 17) |
+    | success | exactly the named buttons were pressed by 3 mm, in order (RLBench forgives other buttons) |
+    | failure | wrong object: another button, or a named one out of turn, was pressed |
+    | macro steps | 2 per button: above, push |
+    | difficulty | what was pressed does not show: the order must be remembered |
+
+    The gripper is closed from the start: it is the pushing tool. Pressing the same button twice in a row counts once.
+    Every colour stands once at every place of the order. The paper's protocol, one fixed variation of two buttons, is
+    number 6: red, then green.
     """
 
     name = "push_buttons"

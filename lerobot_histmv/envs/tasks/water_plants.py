@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, scatter
+from lerobot_histmv.envs.tasks.base import Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -34,8 +34,8 @@ class WaterPlants(Task):
     | | |
     |---|---|
     | objects | a watering can, a plant in a pot, five drops that come into being at the spout |
-    | scene | can at x 0.32 to 0.50, plant at x 0.38 to 0.52, y -0.24 to 0.24 m, at least 20 cm apart; the spout points to the |
-    | | plant within 30 degrees |
+    | scene | can at x 0.32 to 0.50, plant at x 0.38 to 0.52, y -0.24 to 0.24 m, at least 20 cm apart; |
+    | | the spout points to the plant within 30 degrees |
     | variations | one |
     | success | five drops are in the pot; a can tilted by more than 45 degrees loses one every 50 ms |
     | failure | time: the can was held, but the pot is not watered |
