@@ -24,7 +24,7 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
         setup: what the worker processes must know.
         workers: number of processes.
         outcomes: finished attempts; grows.
-        episodes: successes to reach.
+        episodes: successes of every task to reach.
 
     Raises:
         ValueError: the recording would need scene seeds that belong to evaluation.
@@ -35,8 +35,8 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
     pending: dict[Future[Outcome], int] = {}
     with _one_thread_each(), ProcessPoolExecutor(workers, context, start_worker, (setup,)) as pool:
         try:
-            while missing := missing_attempts(outcomes, episodes):
-                _check_sense(setup.seed + missing[-1], outcomes)
+            while missing := missing_attempts(outcomes, episodes, len(setup.tasks)):
+                _check_sense(setup.seed + max(missing), outcomes)
                 ready = [attempt for attempt in missing if attempt not in pending.values()]
                 for attempt in ready[: workers + 1 - len(pending)]:
                     pending[pool.submit(make_attempt, attempt)] = attempt

@@ -77,7 +77,13 @@ def dispatch(name: str, arguments: Sequence[str]) -> None:
 
     run, config_class = runner(name)
     parse = getattr(config_class, "parse", partial(draccus.parse, config_class))
-    run(parse(args=list(arguments), prog=f"histmv {name}"))
+    run(parse(args=[underscored(word) for word in arguments], prog=f"histmv {name}"))
+
+
+def underscored(word: str) -> str:
+    """``--an-option=value`` as ``--an_option=value``, which is how LeRobot and draccus spell options."""
+    option, equals, value = word.partition("=")
+    return f"--{option[2:].replace('-', '_')}{equals}{value}" if option.startswith("--") else word
 
 
 def user_errors() -> tuple[type[Exception], ...]:

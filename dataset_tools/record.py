@@ -1,4 +1,4 @@
-"""``histmv record``: the scripted expert of a task demonstrates it; a LeRobot dataset holds one row per frame."""
+"""``histmv record``: the scripted experts of tasks demonstrate them; a LeRobot dataset holds one row per frame."""
 
 import importlib
 import threading
@@ -18,8 +18,9 @@ from dataset_tools.record_report import default_root, progress_bar, recording_re
 from dataset_tools.record_settings import SEED_LIMIT, RecordSettings
 from dataset_tools.record_worker import WorkerSetup
 from dataset_tools.shards import Outcome, made_attempts, missing_attempts, read_outcomes, write_json
-from lerobot_histmv.envs import TASKS, make
+from lerobot_histmv.envs import make
 from lerobot_histmv.envs.interface import CAMERA_NAMES, check_options
+from lerobot_histmv.envs.tasks import suites
 
 
 @dataclass
@@ -28,7 +29,7 @@ class RecordEnvConfig:
 
     # The environment type; only this one has scripted experts.
     type: str = "ur5"
-    # The task to demonstrate: pick_and_lift, push_buttons or reach_target.
+    # What to demonstrate: a task (turn_tap), a variation (turn_tap.left), a suite (set1), or several joined by commas.
     task: str = ""
     # Index of the variation to record; by default each episode's seed draws one.
     variation: int | None = None
@@ -40,12 +41,14 @@ class RecordEnvConfig:
 
 @dataclass
 class RecordConfig:
-    """Record successful demonstrations of one task."""
+    """Record successful demonstrations."""
 
     env: RecordEnvConfig = field(default_factory=RecordEnvConfig)
-    # Successful episodes that the dataset shall hold.
+    # Successful episodes of every task that is named; their seeds draw the variations.
     episodes: int = 50
-    # Name of the dataset; by default local/ur5_<task>.
+    # Instead: successful episodes of every variation of every task that is named.
+    episodes_per_variation: int | None = None
+    # Name of the dataset; by default local/ur5_<task>, the first one of several.
     repo_id: str | None = None
     # Directory of the dataset; by default $HF_LEROBOT_HOME/<repo_id>.
     root: str | None = None
@@ -66,33 +69,37 @@ def run(config: RecordConfig) -> None:
         ValueError: a setting is impossible, or something in the way must not be overwritten.
     """
     settings = checked_settings(config)
-    repo_id = config.repo_id or f"local/ur5_{settings.task}"
+    repo_id = config.repo_id or f"local/ur5_{config.env.task.split(',')[0].strip()}"
     options: dict[str, Any] = {
         "cameras": settings.cameras,
         "image_size": settings.image_size,
         "render_size": settings.image_size,
         "variation": settings.variation,
     }
-    check_options(settings.task, **options)
-    make_env = partial(make, settings.task, **options)
+    for task in settings.tasks:
+        check_options(task, **options)
+    make_env = partial(make, **options)
     root = Path(config.root).expanduser().resolve() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
-    recorder.record(config.episodes, config.workers)
+    recorder.record(config.episodes_per_variation or config.episodes, config.workers)
 
 
 def checked_settings(config: RecordConfig) -> RecordSettings:
     """The settings in ``config``; ValueError names what is wrong with them."""
     if config.env.type != "ur5":
         raise ValueError(f"env.type is {config.env.type!r}; only 'ur5' has scripted experts")
-    if config.env.task not in TASKS:
-        raise ValueError(f"env.task is {config.env.task!r}; accepted is one of {sorted(TASKS)}")
-    for name, value in (("episodes", config.episodes), ("workers", config.workers)):
-        if value < 1:
+    each = config.episodes_per_variation
+    for name, value in (("episodes", config.episodes), ("episodes_per_variation", each), ("workers", config.workers)):
+        if value is not None and value < 1:
             raise ValueError(f"{name} is {value}; it must be at least 1")
-    if config.seed + config.episodes > SEED_LIMIT:
-        raise ValueError(f"seed {config.seed} and {config.episodes} episodes exceed the {SEED_LIMIT} recording seeds")
+    tasks = suites.expand(config.env.task)
+    if each is not None:
+        tasks = [name for task in tasks for name in suites.variation_names(task)]
+    episodes = len(tasks) * (each or config.episodes)
+    if config.seed + episodes > SEED_LIMIT:
+        raise ValueError(f"seed {config.seed} and {episodes} episodes exceed the {SEED_LIMIT} recording seeds")
     return RecordSettings(
-        task=config.env.task,
+        tasks=tuple(tasks),
         variation=config.env.variation,
         cameras=tuple(config.env.cameras),
         image_size=config.env.image_size,
@@ -106,19 +113,21 @@ class Recorder:
 
     Args:
         settings: what decides its content.
-        make_env: makes the environment in each worker process; must be picklable.
+        make_env: makes a task's environment in a worker process; must be picklable.
         place: where it is recorded.
         repo_id: its name.
     """
 
-    def __init__(self, settings: RecordSettings, make_env: Callable[[], Any], place: RecordPlace, repo_id: str) -> None:
+    def __init__(
+        self, settings: RecordSettings, make_env: Callable[[str], Any], place: RecordPlace, repo_id: str
+    ) -> None:
         self._settings, self._make_env, self._place, self._repo_id = settings, make_env, place, repo_id
         self._console = Console(highlight=False)
 
     def record(self, episodes: int, workers: int) -> None:
-        """Record until the dataset holds ``episodes`` successes, unless it already does."""
+        """Record until the dataset holds ``episodes`` successes of every task, unless it already does."""
         started = time.monotonic()
-        finished = self._place.finished(episodes)
+        finished = self._place.finished(episodes * len(self._settings.tasks))
         if finished is not None:
             self._say(f"already recorded: {summary_line(finished)}")
         else:
@@ -137,13 +146,14 @@ class Recorder:
             except KeyboardInterrupt:
                 self._say("stopped; finished episodes are kept and the same command goes on from there")
                 raise
-            made = made_attempts(outcomes, episodes)
+            made = made_attempts(outcomes, episodes, len(self._settings.tasks))
             self._place.commit(partial(self._write, parts, made))
         return made
 
     def _attempt(self, parts: Path, outcomes: dict[int, Outcome], episodes: int, workers: int) -> None:
         setup = WorkerSetup(
             directory=parts,
+            tasks=self._settings.tasks,
             make_env=self._make_env,
             cameras=self._settings.cameras,
             stride=self._settings.stride,
@@ -151,13 +161,13 @@ class Recorder:
         )
         # LeRobot takes long to import and is needed only at the end.
         threading.Thread(target=importlib.import_module, args=("dataset_tools.assembly",), daemon=True).start()
+        tasks = self._settings.tasks
+        total = episodes * len(tasks)
         with progress_bar(self._console) as progress:
-            kept = episodes - len(missing_attempts(outcomes, episodes))
-            bar = progress.add_task(self._settings.task, total=episodes, completed=kept)
+            bar = progress.add_task(tasks[0] if len(tasks) == 1 else f"{len(tasks)} tasks", total=total)
+            progress.update(bar, completed=total - len(missing_attempts(outcomes, episodes, len(tasks))))
             for _ in make_attempts(setup, workers, outcomes, episodes):
-                kept = episodes - len(missing_attempts(outcomes, episodes))
-                progress.update(bar, completed=kept)
-            progress.update(bar, completed=episodes)
+                progress.update(bar, completed=total - len(missing_attempts(outcomes, episodes, len(tasks))))
 
     def _write(self, parts: Path, made: list[Outcome], root: Path) -> None:
         from dataset_tools.assembly import assemble

@@ -25,8 +25,8 @@ def recording_report(settings: RecordSettings, made: Sequence[Outcome]) -> dict[
         made: all attempts in order, up to the one that completed it.
 
     Returns:
-        settings; episodes, rows, attempts, success rate; per episode its scene seed and variation; failed attempts;
-        versions of the packages involved.
+        settings; episodes, rows, attempts, success rate; per episode its task, scene seed and variation; failed
+        attempts; versions of the packages involved.
     """
     kept = [outcome for outcome in made if outcome.success]
     return {
@@ -35,10 +35,11 @@ def recording_report(settings: RecordSettings, made: Sequence[Outcome]) -> dict[
         "rows": sum(outcome.rows for outcome in kept),
         "attempts": len(made),
         "success_rate": len(kept) / len(made),
+        "tasks": [outcome.task for outcome in kept],
         "seeds": [outcome.seed for outcome in kept],
         "variations": [outcome.variation for outcome in kept],
         "failures": [
-            {"seed": outcome.seed, "variation": outcome.variation, "failure": outcome.failure}
+            {"task": outcome.task, "seed": outcome.seed, "variation": outcome.variation, "failure": outcome.failure}
             for outcome in made
             if not outcome.success
         ],
@@ -50,9 +51,11 @@ def summary_line(report: dict[str, Any]) -> str:
     """One line: what the dataset holds and how often the expert succeeded."""
     failures = Counter(failure["failure"] for failure in report["failures"])
     why = f" ({', '.join(f'{kind}: {number}' for kind, number in failures.most_common())})" if failures else ""
+    tasks = report["settings"]["tasks"]
     return (
-        f"{report['settings']['task']}: {report['episodes']} episodes, {report['rows']} rows; the expert succeeded in "
-        f"{report['episodes']} of {report['attempts']} attempts, {100 * report['success_rate']:.1f} %{why}"
+        f"{tasks[0] if len(tasks) == 1 else f'{len(tasks)} tasks'}: {report['episodes']} episodes, {report['rows']} "
+        f"rows; the expert succeeded in {report['episodes']} of {report['attempts']} attempts, "
+        f"{100 * report['success_rate']:.1f} %{why}"
     )
 
 

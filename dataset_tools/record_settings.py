@@ -19,7 +19,7 @@ class RecordSettings:
     """Everything that decides the bytes of the dataset but the number of its episodes.
 
     Args:
-        task: name of the environment's task.
+        tasks: names of the tasks; every one gets as many episodes.
         variation: the one to record; None: each seed draws its own.
         cameras: names, in the order of the calibration vectors.
         image_size: side of the images [pixels].
@@ -27,7 +27,7 @@ class RecordSettings:
         seed: scene seed of the first attempt, below ``SEED_LIMIT``.
     """
 
-    task: str
+    tasks: tuple[str, ...]
     variation: int | None
     cameras: tuple[str, ...]
     image_size: int
@@ -50,7 +50,7 @@ class RecordSettings:
 
     def as_json(self) -> dict[str, Any]:
         """The same as a JSON file gives it back."""
-        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
+        return {**dataclasses.asdict(self), "tasks": list(self.tasks), "cameras": list(self.cameras)}
 
     def check_same(self, found: Mapping[str, Any], where: Path, advice: str) -> None:
         """Raise ValueError if the settings ``found`` at ``where`` are not these."""

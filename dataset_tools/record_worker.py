@@ -10,7 +10,6 @@ import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,42 +28,51 @@ class WorkerSetup:
 
     Args:
         directory: where shards go.
-        make_env: called once per process; must be picklable.
+        tasks: names; attempt i is at task i modulo their number.
+        make_env: makes a task's environment; must be picklable.
         cameras: names, in the order of the calibration vectors.
         stride: control ticks per recorded frame.
         seed: scene seed of attempt 0.
     """
 
     directory: Path
-    make_env: Callable[[], Any]
+    tasks: tuple[str, ...]
+    make_env: Callable[[str], Any]
     cameras: tuple[str, ...]
     stride: int
     seed: int
 
 
 class Worker:
-    """Makes attempts with one environment, which lives as long as the process."""
+    """Makes attempts with one environment, which lives until an attempt at another task."""
 
     def __init__(self, setup: WorkerSetup) -> None:
         self.setup = setup
+        self._task, self._env = "", None
 
-    @cached_property
-    def env(self) -> Any:
-        """The environment, made when first needed, so that what it raises is an attempt's error."""
-        return self.setup.make_env()
+    def env(self, task: str) -> Any:
+        """The task's environment, made when first needed, so that what it raises is an attempt's error."""
+        if self._env is None or self._task != task:
+            if self._env is not None:
+                self._env.close()
+            self._task, self._env = task, self.setup.make_env(task)
+        return self._env
 
     def make_attempt(self, attempt: int) -> Outcome:
         """Let the expert act in the attempt's scene and commit the shard."""
         setup, seed = self.setup, self.setup.seed + attempt
-        _, info = self.env.reset(seed=seed)
-        demonstration = Demonstration(self.env, setup.cameras, setup.stride)
+        task = setup.tasks[attempt % len(setup.tasks)]
+        env = self.env(task)
+        _, info = env.reset(seed=seed)
+        demonstration = Demonstration(env, setup.cameras, setup.stride)
         failure = demonstration.run()
         outcome = Outcome(
             attempt=attempt,
             seed=seed,
+            task=task,
             variation=int(info["variation"]),
             instruction=info["instruction"],
-            paraphrases=list(self.env.paraphrases),
+            paraphrases=list(env.paraphrases),
             failure=failure,
             rows=len(demonstration.actions),
         )

@@ -8,7 +8,7 @@ metadata what the dataset must know about it), ``attempt-000008.json`` says why 
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -28,6 +28,7 @@ class Outcome:
 
     Args:
         attempt: index of the attempt; its scene seed is the recording's seed plus this.
+        task: name of the task that was attempted.
         failure: why it failed; empty for a success.
         rows: frames recorded.
         instruction: the paraphrase drawn for the episode.
@@ -37,6 +38,7 @@ class Outcome:
 
     attempt: int
     seed: int
+    task: str
     variation: int
     instruction: str
     paraphrases: list[str]
@@ -92,36 +94,36 @@ def read_outcomes(directory: Path) -> dict[int, Outcome]:
     return outcomes
 
 
-def missing_attempts(outcomes: Mapping[int, Outcome], episodes: int) -> list[int]:
-    """The attempts to make next, if each of them were to succeed.
+def missing_attempts(outcomes: Mapping[int, Outcome], episodes: int, tasks: int = 1) -> list[int]:
+    """The attempts to make next, if each of them were to succeed, task by task.
 
-    The dataset is the first ``episodes`` successes in order of their attempts. Every gap before the last of them must
-    be filled, whoever left it: that makes the result independent of the number of workers and of kills.
+    Attempt i is at task i modulo ``tasks``. The dataset is the first ``episodes`` successes of every task, in order of
+    their attempts. Every gap before the last of them must be filled, whoever left it: that makes the result independent
+    of the number of workers and of kills.
     """
-    missing: list[int] = []
-    successes = 0
-    for attempt in count():
-        if successes + len(missing) >= episodes:
-            break
-        if attempt not in outcomes:
-            missing.append(attempt)
-        elif outcomes[attempt].success:
-            successes += 1
-    return missing
+    return [attempt for attempt in _needed_attempts(outcomes, episodes, tasks) if attempt not in outcomes]
 
 
-def made_attempts(outcomes: Mapping[int, Outcome], episodes: int) -> list[Outcome]:
-    """The attempts up to the one that completed the dataset, in order, failures included.
+def _needed_attempts(outcomes: Mapping[int, Outcome], episodes: int, tasks: int) -> Iterator[int]:
+    """Attempts up to each task's last episode, task by task, if those not made yet were to succeed."""
+    for task in range(tasks):
+        attempts = count(task, tasks)
+        successes = 0
+        while successes < episodes:
+            attempt = next(attempts)
+            successes += attempt not in outcomes or outcomes[attempt].success
+            yield attempt
+
+
+def made_attempts(outcomes: Mapping[int, Outcome], episodes: int, tasks: int = 1) -> list[Outcome]:
+    """The attempts up to those that completed the dataset, in order, failures included.
 
     Raises:
-        ValueError: the outcomes do not hold ``episodes`` successes without gaps.
+        ValueError: the outcomes do not hold ``episodes`` successes of every task without gaps.
     """
-    if missing := missing_attempts(outcomes, episodes):
+    if missing := missing_attempts(outcomes, episodes, tasks):
         raise ValueError(f"the recording is not complete: attempts {missing} are missing for {episodes} episodes")
-    made: list[Outcome] = []
-    while sum(outcome.success for outcome in made) < episodes:
-        made.append(outcomes[len(made)])
-    return made
+    return [outcomes[attempt] for attempt in sorted(_needed_attempts(outcomes, episodes, tasks))]
 
 
 def _read_outcome(path: Path) -> Outcome:

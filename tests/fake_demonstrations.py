@@ -29,16 +29,20 @@ class FakeEnv:
     """Two motions of five ticks; the gripper closes with the second.
 
     Args:
+        task: what it is asked for; it makes no difference.
         seconds: how long an episode takes.
         crash_file: while this file exists, every episode ends its process.
         error_file: while this file exists, every episode raises.
     """
 
-    def __init__(self, seconds: float = 0.0, crash_file: str = "", error_file: str = "") -> None:
-        self.seconds, self.crash_file, self.error_file = seconds, crash_file, error_file
+    def __init__(self, task: str = "", seconds: float = 0.0, crash_file: str = "", error_file: str = "") -> None:
+        self.task, self.seconds, self.crash_file, self.error_file = task, seconds, crash_file, error_file
 
     def failure(self) -> str:
         return "grasp missed"
+
+    def close(self) -> None:
+        pass
 
     def reset(self, *, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
         self.seed, self.ticks = seed, 0
@@ -88,6 +92,6 @@ def recorder(root: Path, **env: Any) -> "Recorder":
     from dataset_tools.record_place import RecordPlace
     from dataset_tools.record_settings import RecordSettings
 
-    settings = RecordSettings("pick_and_lift", None, CAMERAS, SIZE, 20, 0)
+    settings = RecordSettings(("pick_and_lift",), None, CAMERAS, SIZE, 20, 0)
     place = RecordPlace(root, settings, overwrite=False)
     return Recorder(settings, partial(FakeEnv, **env), place, "local/fake")

@@ -14,9 +14,10 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_histmv import keys
-from lerobot_histmv.envs import TASKS, UR5Env, make
+from lerobot_histmv.envs import UR5Env, make
 from lerobot_histmv.envs.interface import ACTION_SIZE, CAMERA_NAMES, STATE_SIZE, check_options
 from lerobot_histmv.envs.processor_ur5 import UR5DepthProcessorStep
+from lerobot_histmv.envs.tasks import suites
 
 
 @EnvConfig.register_subclass("ur5")
@@ -25,7 +26,7 @@ class UR5EnvConfig(EnvConfig):
     """UR5e tasks.
 
     Args:
-        task: one of ``lerobot_histmv.envs.TASKS``, or several joined by commas.
+        task: a task (turn_tap), a variation (turn_tap.left) or a suite (set1), or several joined by commas.
         fps: control ticks per second of simulated time; fixed.
         cameras: which of front, left_shoulder and wrist to render, in this order.
         image_size: width and height of the images [pixels].
@@ -75,8 +76,8 @@ class UR5EnvConfig(EnvConfig):
 
     @property
     def tasks(self) -> list[str]:
-        """Names in ``task``."""
-        return [name.strip() for name in (self.task or ",".join(TASKS)).split(",")]
+        """Tasks and variations that ``task`` names; without a name, all tasks."""
+        return suites.expand(self.task or "all")
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from lerobot_histmv import geometry, keys
 from lerobot_histmv.envs.motion import Pose
-from lerobot_histmv.envs.tasks import TASKS
+from lerobot_histmv.envs.tasks import suites
 from lerobot_histmv.envs.tasks.base import SPLITS
 
 CAMERA_NAMES = ("front", "left_shoulder", "wrist")
@@ -35,8 +35,8 @@ def check_options(
     render_size: int = 256,
 ) -> None:
     """Raise ValueError for an option of ``UR5Env`` that is not accepted, saying what would be."""
+    fixed_variation(task, variation)
     for name, value, accepted in (
-        ("task", task, tuple(TASKS)),
         ("control", control, CONTROLS),
         ("instruction_split", instruction_split, SPLITS),
         ("render_mode", render_mode, RENDER_MODES),
@@ -52,15 +52,22 @@ def check_options(
     for name, size in (("image_size", image_size), ("render_size", render_size)):
         if not low <= size <= high:
             raise ValueError(f"{name} is {size}; it must lie between {low} and {high} pixels")
-    if variation is not None:
-        check_variation(task, variation)
 
 
-def check_variation(task: str, variation: int) -> int:
-    """``variation`` as an int if ``task`` has it."""
-    count = len(TASKS[task].variations)
+def fixed_variation(task: str, variation: int | None) -> int | None:
+    """The one variation that ``task`` ("turn_tap.left") or ``variation`` names; None if both leave it open.
+
+    Raises:
+        ValueError: no such task or variation, or two different ones.
+    """
+    found, named = suites.find(task)
+    if variation is None:
+        return named
+    count = len(found.variations)
     if not 0 <= variation < count:
         raise ValueError(f"variation {variation} of {task} does not exist; there are 0 to {count - 1}")
+    if named not in (None, variation):
+        raise ValueError(f"task {task} is variation {named}, but variation is {variation}; give one of the two")
     return int(variation)
 
 

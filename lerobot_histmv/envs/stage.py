@@ -10,7 +10,7 @@ from lerobot_histmv.envs.camera import Renderer, samples_for
 from lerobot_histmv.envs.controller import Controller
 from lerobot_histmv.envs.motion import Motion, Pose
 from lerobot_histmv.envs.simulation import Simulation
-from lerobot_histmv.envs.tasks import TASKS
+from lerobot_histmv.envs.tasks.base import Task
 
 SETTLE_TICKS = 10
 """Ticks before an episode starts: objects come to rest and the gripper takes its initial command."""
@@ -20,12 +20,12 @@ class Stage:
     """Everything behind an environment that cannot be pickled.
 
     Args:
-        task: name in ``TASKS``.
+        task: what is to be done in it.
         image_size: largest image side [pixels] that will be rendered.
     """
 
-    def __init__(self, task: str, image_size: int) -> None:
-        self.task = TASKS[task]()
+    def __init__(self, task: type[Task], image_size: int) -> None:
+        self.task = task()
         self.simulation = Simulation(self.task.objects, samples_for(image_size))
         self.controller = Controller(self.simulation)
         self.renderer = Renderer(self.simulation.model)

@@ -11,7 +11,7 @@ from lerobot_histmv import keys
 from lerobot_histmv.envs import interface
 from lerobot_histmv.envs.interface import CAMERA_NAMES
 from lerobot_histmv.envs.motion import Motion, Tick
-from lerobot_histmv.envs.tasks import TASKS
+from lerobot_histmv.envs.tasks import suites
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.stage import Stage
@@ -23,7 +23,7 @@ Observation = dict[str, Any]
 
 
 class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
-    """A UR5e with a Robotiq 2F-85 at a table, doing one of ``TASKS``.
+    """A UR5e with a Robotiq 2F-85 at a table, doing a task.
 
     Frame: the robot's base (ROS ``base_link``) = world, metres, z up, table top at z = 0. The tool is the pinch point
     between the finger pads; its z axis points back to the wrist, its y axis from finger to finger, so that a gripper
@@ -59,20 +59,13 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
 
     Cameras: front and left_shoulder are fixed, wrist moves with the gripper.
 
-    **Tasks.** Each scene has three objects in x 0.3 to 0.6, y -0.28 to 0.28 [m], of different colours out of red,
-    green, blue, yellow, purple and cyan.
-
-    | task | objects | success | variations | macro steps of the expert |
-    |---|---|---|---|---|
-    | reach_target | spheres, 5 to 20 cm up | tool within 2 cm of the named centre | 6 | 2 |
-    | push_buttons | buttons, >= 14 cm apart | the named 1 to 3 pressed in order, no other | 18 | 2 per button |
-    | pick_and_lift | 4 cm cubes, any yaw, >= 10 cm apart | named cube in both pads, above 0.2 m | 6 | 4 |
-
-    Success is judged when a step ends; what was pressed is remembered from every tick. Reward: 1 on success, else 0.
+    **Tasks.** The classes in ``lerobot_histmv.envs.tasks`` specify them: objects, scene, variations, success, failure
+    and the expert's macro steps. Success is judged when a step ends; what must be remembered (a press, a grasp) is
+    noted at every tick. Reward: 1 on success, else 0.
     **End**: ``terminated`` at success; ``truncated`` after twice the expert's macro steps (servo: 40 ticks for each).
 
-    **Reset.** The tool is at (0.28, 0, 0.40), pointing down; the gripper is open, but closed in push_buttons, where it
-    is the pushing tool. The seed alone decides variation, instruction and scene; fixing the variation by argument or
+    **Reset.** The tool is at (0.28, 0, 0.40), pointing down; the gripper is open, but closed where it is the
+    pushing tool. The seed alone decides variation, instruction and scene; fixing the variation by argument or
     by ``options={"variation": i}`` leaves the objects' places as they are. Seeds below 100,000 are for recording, those
     up to 199,999 for evaluation during training, those from 200,000 for reported results.
 
@@ -88,7 +81,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
     | time | the right thing was begun and not finished |
 
     Args:
-        task: name in ``TASKS``.
+        task: name of a task, or of one of its variations (``turn_tap.left``).
         cameras: which cameras to render, in which order.
         image_size: side of the images [pixels].
         control: ``macro`` or ``servo``.
@@ -115,6 +108,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
             task, cameras, image_size, control, variation, instruction_split, render_mode, render_size
         )
         self.task = task
+        self.task_class = suites.find(task)[0]
         self.cameras = tuple(cameras)
         self.image_size, self.render_size = image_size, render_size
         self.control, self.render_mode = control, render_mode
@@ -122,25 +116,25 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         self.record_substeps = False
         self.action_space = interface.action_space()
         self.observation_space = interface.observation_space(self.cameras, image_size)
-        self._fixed_variation = variation
+        self._fixed_variation = interface.fixed_variation(task, variation)
         self._stage: Stage | None = None
-        self.variation = variation or 0
+        self.variation = self._fixed_variation or 0
         self.task_description = self.paraphrases[0]
 
     @property
     def paraphrases(self) -> tuple[str, ...]:
         """All instructions of the current variation, in the split that ``instruction_split`` names."""
-        return TASKS[self.task].instructions(self.variation, self.instruction_split)
+        return self.task_class.instructions(self.variation, self.instruction_split)
 
     @property
     def _max_episode_steps(self) -> int:
         """Most steps of any episode; LeRobot's evaluation reads it."""
         fixed = self._fixed_variation
-        variations = range(len(TASKS[self.task].variations)) if fixed is None else [fixed]
+        variations = range(len(self.task_class.variations)) if fixed is None else [fixed]
         return max(self._step_limit(variation) for variation in variations)
 
     def _step_limit(self, variation: int) -> int:
-        limit = 2 * TASKS[self.task].macro_steps(variation)
+        limit = 2 * self.task_class.macro_steps(variation)
         return limit if self.control == "macro" else limit * SERVO_TICKS
 
     @property
@@ -161,14 +155,15 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         """
         super().reset(seed=seed)
         rng = np.random.default_rng(self.np_random.integers(2**63) if seed is None else seed)
-        drawn = int(rng.integers(len(TASKS[self.task].variations)))
+        drawn = int(rng.integers(len(self.task_class.variations)))
         asked = (options or {}).get("variation", self._fixed_variation)
-        self.variation = drawn if asked is None else interface.check_variation(self.task, asked)
+        fixed = interface.fixed_variation(self.task, asked)
+        self.variation = drawn if fixed is None else fixed
         self.task_description = self.paraphrases[int(rng.random() * len(self.paraphrases))]
         if self._stage is None:
             from lerobot_histmv.envs.stage import Stage
 
-            self._stage = Stage(self.task, max(self.image_size, self.render_size))
+            self._stage = Stage(self.task_class, max(self.image_size, self.render_size))
         self._steps, self._out_of_reach = 0, False
         self._frames: list[UInt8[np.ndarray, "h w 3"]] = []
         self.stage.reset(self.variation, rng)

@@ -16,6 +16,7 @@ from dataset_tools.record import RecordConfig, checked_settings, run
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.record_report import default_root
 from dataset_tools.record_settings import RecordSettings
+from lerobot_histmv.envs.tasks.suites import SUITES
 
 EPISODES = 7
 SUCCESSES = [seed for seed in range(50) if seed not in FAILING_SEEDS][:EPISODES]
@@ -115,9 +116,12 @@ def test_broken_attempts_are_reported_and_resumed(uninterrupted: Path, tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--env.task=make_coffee"], "env.task is 'make_coffee'; accepted is one of .*pick_and_lift"),
-        ([], "env.task is ''; accepted is one of"),
-        (["--env.task=pick_and_lift,push_buttons"], "accepted is one of"),
+        (["--env.task=make_coffee"], "task is 'make_coffee'; accepted are .*pick_and_lift.* suites set1"),
+        ([], "task is ''; accepted are"),
+        (["--env.task=turn_tap,turn_tap"], "names turn_tap more than once"),
+        (["--env.task=turn_tap.up"], "variations of turn_tap are turn_tap.left, turn_tap.right"),
+        (["--env.task=turn_tap.left", "--env.variation=1"], "give one of the two"),
+        (["--env.task=turn_tap", "--episodes_per_variation=0"], "episodes_per_variation is 0"),
         (["--env.task=pick_and_lift", "--episodes=0"], "episodes is 0; it must be at least 1"),
         (["--env.task=pick_and_lift", "--workers=0"], "workers is 0"),
         (["--env.task=pick_and_lift", "--fps=15"], r"fps is 15; .* 20 Hz, so accepted are \[1, 2, 4, 5, 10, 20\]"),
@@ -139,8 +143,18 @@ def test_impossible_settings_are_refused(tmp_path: Path, arguments: list[str], m
 def test_flags_reach_the_settings() -> None:
     flags = ["--env.task=pick_and_lift", "--env.variation=2", "--env.cameras=[wrist,front]", "--env.image_size=64"]
     config = draccus.parse(RecordConfig, args=[*flags, "--fps=10", "--seed=11", "--overwrite=true"])
-    assert checked_settings(config) == RecordSettings("pick_and_lift", 2, ("wrist", "front"), 64, 10, 11)
+    assert checked_settings(config) == RecordSettings(("pick_and_lift",), 2, ("wrist", "front"), 64, 10, 11)
     assert config.overwrite
+
+
+def test_suites_and_variations_become_tasks() -> None:
+    def tasks(*flags: str) -> tuple[str, ...]:
+        return checked_settings(draccus.parse(RecordConfig, args=list(flags))).tasks
+
+    assert tasks("--env.task=turn_tap,reach_target") == ("turn_tap", "reach_target")
+    split = ("turn_tap.left", "turn_tap.right", "open_door")
+    assert tasks("--env.task=turn_tap,open_door", "--episodes_per_variation=3") == split
+    assert tasks("--env.task=set1", "--episodes_per_variation=3") == SUITES["set1"]
 
 
 @pytest.mark.parametrize("home", [None, "~/elsewhere"])

@@ -28,7 +28,7 @@ REPO_ID = "local/fake"
 @pytest.fixture(scope="module")
 def outcomes_and_fast(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Outcome], LeRobotDataset]:
     directory = tmp_path_factory.mktemp("fast")
-    worker = Worker(WorkerSetup(directory, FakeEnv, CAMERAS, stride=1, seed=0))
+    worker = Worker(WorkerSetup(directory, ("lift",), FakeEnv, CAMERAS, stride=1, seed=0))
     outcomes = [worker.make_attempt(seed) for seed in SEEDS]
     assemble(directory, outcomes, FEATURES, FPS, REPO_ID, directory / "dataset")
     return outcomes, LeRobotDataset(REPO_ID, root=directory / "dataset")
@@ -128,7 +128,7 @@ def test_a_frame_commands_what_holds_at_its_end(stride: int, expected: list[int]
 
 
 def test_failed_attempts_leave_only_their_reason(tmp_path: Path) -> None:
-    worker = Worker(WorkerSetup(tmp_path, FakeEnv, CAMERAS, stride=1, seed=FAILING_SEEDS[0]))
+    worker = Worker(WorkerSetup(tmp_path, ("lift",), FakeEnv, CAMERAS, stride=1, seed=FAILING_SEEDS[0]))
     outcome = worker.make_attempt(0)
     assert (outcome.failure, outcome.seed, outcome.success) == ("grasp missed", FAILING_SEEDS[0], False)
     assert [path.suffix for path in tmp_path.iterdir()] == [".json"]
@@ -139,7 +139,7 @@ def test_unreachable_targets_are_failures_of_the_arm(tmp_path: Path) -> None:
         def execute(self, motion: int, on_tick: object) -> None:
             raise ValueError("out of reach")
 
-    outcome = Worker(WorkerSetup(tmp_path, Unreachable, CAMERAS, stride=1, seed=0)).make_attempt(0)
+    outcome = Worker(WorkerSetup(tmp_path, ("lift",), Unreachable, CAMERAS, stride=1, seed=0)).make_attempt(0)
     assert outcome.failure == "ik"
 
 

@@ -21,8 +21,8 @@ pytest.importorskip("mujoco")
 
 def worker(directory: Path, task: str = "pick_and_lift") -> Worker:
     directory.mkdir(exist_ok=True)
-    make_env = partial(make, task, cameras=CAMERAS, image_size=SIZE, render_size=SIZE)
-    return Worker(WorkerSetup(directory, make_env, CAMERAS, stride=1, seed=0))
+    make_env = partial(make, cameras=CAMERAS, image_size=SIZE, render_size=SIZE)
+    return Worker(WorkerSetup(directory, (task,), make_env, CAMERAS, stride=1, seed=0))
 
 
 @pytest.fixture(scope="module")

@@ -32,6 +32,12 @@ def fake_command(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
+@pytest.mark.parametrize("word", ["--size=-7", "--si-ze=3"])
+def test_options_may_be_spelt_with_dashes(word: str) -> None:
+    assert cli.underscored(word) == {"--size=-7": "--size=-7", "--si-ze=3": "--si_ze=3"}[word]
+    assert cli.underscored("a-b") == "a-b"
+
+
 def test_help_lists_every_command_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["--help"])
     out = capsys.readouterr().out

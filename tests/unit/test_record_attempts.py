@@ -12,14 +12,14 @@ from dataset_tools.shards import Outcome
 
 def outcomes(failures: int, successes: int) -> dict[int, Outcome]:
     kinds = ["time"] * failures + [""] * successes
-    return {i: Outcome(i, i, 0, "lift", ["lift"], kind, 3) for i, kind in enumerate(kinds)}
+    return {i: Outcome(i, i, "lift", 0, "lift", ["lift"], kind, 3) for i, kind in enumerate(kinds)}
 
 
 def start(seed: int, made: dict[int, Outcome], episodes: int) -> None:
-    def no_env() -> None:
+    def no_env(task: str) -> None:
         raise AssertionError("no process may be started")
 
-    next(make_attempts(WorkerSetup(Path(), no_env, ("front",), 1, seed), 2, made, episodes))
+    next(make_attempts(WorkerSetup(Path(), ("lift",), no_env, ("front",), 1, seed), 2, made, episodes))
 
 
 def test_an_expert_that_mostly_fails_is_given_up() -> None:

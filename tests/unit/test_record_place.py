@@ -9,7 +9,7 @@ import pytest
 from dataset_tools.record_place import RECORDING_FILE, RecordPlace
 from dataset_tools.record_settings import RecordSettings
 
-SETTINGS = RecordSettings("pick_and_lift", None, ("front", "wrist"), 32, 20, 0)
+SETTINGS = RecordSettings(("pick_and_lift",), None, ("front", "wrist"), 32, 20, 0)
 
 
 def write_dataset(directory: Path, episodes: int = 5) -> None:

@@ -19,7 +19,7 @@ from dataset_tools.shards import (
 
 
 def outcome(attempt: int, failure: str = "") -> Outcome:
-    return Outcome(attempt, 100 + attempt, 1, "lift", ["lift", "raise"], failure, 3, {"x": {"min": [[[1.5]]]}})
+    return Outcome(attempt, 100 + attempt, "lift", 1, "lift", ["lift", "raise"], failure, 3, {"x": {"min": [[[1.5]]]}})
 
 
 @given(st.data(), st.integers(1, 11), st.sets(st.integers(0, 40)), st.integers(1, 5))
@@ -42,6 +42,18 @@ def test_gaps_are_filled_before_anything_new(successes: dict[int, bool], episode
     missing = missing_attempts(outcomes, episodes)
     assert not set(missing) & set(outcomes)
     assert set(range(max(missing, default=0))) <= set(missing) | set(outcomes)
+
+
+@given(st.integers(1, 5), st.integers(1, 4), st.sets(st.integers(0, 20)))
+def test_every_task_gets_its_episodes(episodes: int, tasks: int, bad: set[int]) -> None:
+    outcomes: dict[int, Outcome] = {}
+    while missing := missing_attempts(outcomes, episodes, tasks):
+        assert [attempt % tasks for attempt in missing] == sorted(attempt % tasks for attempt in missing)
+        outcomes[missing[-1]] = outcome(missing[-1], "time" if missing[-1] in bad else "")
+    made = made_attempts(outcomes, episodes, tasks)
+    assert [one.attempt for one in made] == sorted(outcomes)
+    kept = [one.attempt % tasks for one in made if one.success]
+    assert sorted(kept) == [task for task in range(tasks) for _ in range(episodes)]
 
 
 def test_incomplete_recordings_are_refused() -> None:
