@@ -198,6 +198,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
             "variation": self.variation,
             "failure": self.failure() if ended else "",
             "ticks": self.stage.controller.ticks,
+            **self.stage.task.details(),
         }
 
     def observe(self) -> Observation:

@@ -1,6 +1,7 @@
 """The tasks, by name. A new task is one class in a file of its own, one line here and its objects' descriptions."""
 
 from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.chains import Assembly, Home, Kitchen
 from lerobot_histmv.envs.tasks.hang_frame_on_hanger import HangFrameOnHanger
 from lerobot_histmv.envs.tasks.insert_onto_square_peg import InsertOntoSquarePeg
 from lerobot_histmv.envs.tasks.insert_usb_in_computer import InsertUsbInComputer
@@ -41,5 +42,8 @@ TASKS: dict[str, type[Task]] = {
         MoveHanger,
         InsertUsbInComputer,
         PlaceShapeInShapeSorter,
+        Home,
+        Kitchen,
+        Assembly,
     )
 }

@@ -2,7 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -14,8 +16,29 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "held_out")
 """Instructions for recording and training, and paraphrases kept back for evaluation."""
+RETREAT = 0.12
+"""How far [m] the tool moves back before it turns to another task."""
 WORKSPACE = np.array([[0.3, 0.6], [-0.28, 0.28]])
 """Range of x and of y [m] in which objects lie."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where something may stand: ranges of x and y [m] and of yaw [rad], in the base frame."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    yaw: tuple[float, float] = (0.0, 0.0)
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """x, y, yaw."""
+        x, y, yaw = rng.uniform(*np.array([self.x, self.y, self.yaw]).T).tolist()
+        return x, y, yaw
+
+    @property
+    def area(self) -> Float[np.ndarray, "2 2"]:
+        """Ranges of x and y."""
+        return np.array([self.x, self.y])
 
 
 class Task(ABC):
@@ -32,6 +55,10 @@ class Task(ABC):
     """Split -> paraphrases, with a pair of braces for each word of the variation."""
     initial_gripper: ClassVar[float] = 1.0
     """Gripper command at the start: 1 open, 0 closed."""
+    regions: Mapping[str, Region] = MappingProxyType({})
+    """Where the objects that are not scattered stand; a chain puts them elsewhere."""
+    clear_steps: ClassVar[int] = 2
+    """Macro steps of ``clear``."""
 
     def reset(self, simulation: "Simulation", variation: int, rng: np.random.Generator) -> None:
         """Place all objects and forget the last episode; ``rng`` decides what the variation leaves open."""
@@ -55,9 +82,19 @@ class Task(ABC):
     def failure(self) -> str:
         """Why an episode that has run out of time failed: wrong object, grasp missed, not reached or time."""
 
+    def details(self) -> dict[str, Any]:
+        """What the environment's ``info`` says beyond success and failure."""
+        return {}
+
     @abstractmethod
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Motions that fulfil the task; object poses are read again before each motion."""
+
+    def clear(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Motions after success that leave the gripper empty and out of the way, when another task follows."""
+        tool = simulation.tool_pose()
+        yield Motion(via=(), target=tool, gripper=1.0)
+        yield Motion(via=(), target=tool.retracted(RETREAT), gripper=1.0)
 
     @classmethod
     @abstractmethod

@@ -1,21 +1,18 @@
 """Hang a picture frame on a hook."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.base import Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
-HOOK_AREA = np.array([[0.48, 0.56], [-0.1, 0.1]])
-"""Range of x and y [m] of the hook's board."""
-STAND_AREA = np.array([[0.3, 0.36], [-0.2, 0.2]])
-"""Range of x and y [m] of the frame in its stand."""
-MAX_YAW = np.pi / 8
+YAWS = (-np.pi / 8, np.pi / 8)
 STANDING = 0.0641
 """Height [m] of the standing frame's centre."""
 HANGING = -0.044
@@ -46,6 +43,9 @@ class HangFrameOnHanger(Task):
 
     name = "hang_frame_on_hanger"
     objects: ClassVar[Mapping[str, str]] = {"hook": "wall_hook", "stand": "frame_stand", "frame": "frame"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"hook": Region((0.48, 0.56), (-0.1, 0.1), YAWS), "stand": Region((0.3, 0.36), (-0.2, 0.2), YAWS)}
+    )
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -61,9 +61,9 @@ class HangFrameOnHanger(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The board at the back, the frame in its stand in front."""
-        x, y = rng.uniform(*HOOK_AREA.T)
-        simulation.place_fixed("hook", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
-        (x, y), yaw = rng.uniform(*STAND_AREA.T), rng.uniform(-MAX_YAW, MAX_YAW)
+        x, y, yaw = self.regions["hook"].draw(rng)
+        simulation.place_fixed("hook", (x, y, 0), yaw)
+        x, y, yaw = self.regions["stand"].draw(rng)
         simulation.place_fixed("stand", (x, y, 0), yaw)
         simulation.place_free("frame", (x, y, STANDING), yaw)
 

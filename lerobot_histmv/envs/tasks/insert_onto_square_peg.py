@@ -1,25 +1,19 @@
 """Put a square ring onto the peg of the named colour."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.base import RETREAT, Region, Task
 from lerobot_histmv.envs.tasks.colors import COLORS
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
 PEGS = ("left", "middle", "right")
-PEGS_AREA = np.array([[0.46, 0.56], [-0.1, 0.1]])
-"""Range of x and y [m] of the middle peg."""
-PEGS_YAW = np.pi / 8
-RING_AREA = np.array([[0.28, 0.36], [-0.24, 0.24]])
-"""Range of x and y [m] of the ring's centre."""
-RING_YAW = np.pi / 3
-"""The tab points towards the robot, give or take this angle [rad]."""
 OFF_AXIS = 0.006
 """The ring is on a peg when its centre is this close to the axis [m] ..."""
 HEIGHT = 0.05
@@ -48,6 +42,13 @@ class InsertOntoSquarePeg(Task):
 
     name = "insert_onto_square_peg"
     objects: ClassVar[Mapping[str, str]] = {"pegs": "pegs", "ring": "square_ring"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {
+            "pegs": Region((0.46, 0.56), (-0.1, 0.1), (-np.pi / 8, np.pi / 8)),
+            "ring": Region((0.28, 0.36), (-0.24, 0.24), (-np.pi / 3, np.pi / 3)),
+        }
+    )
+    clear_steps = 1
     variations = tuple((color,) for color in COLORS)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -67,10 +68,10 @@ class InsertOntoSquarePeg(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Board at the back, ring in front of it."""
-        x, y = rng.uniform(*PEGS_AREA.T)
-        simulation.place_fixed("pegs", (x, y, 0), rng.uniform(-PEGS_YAW, PEGS_YAW))
-        x, y = rng.uniform(*RING_AREA.T)
-        simulation.place_free("ring", (x, y, 0.0101), rng.uniform(-RING_YAW, RING_YAW))
+        x, y, yaw = self.regions["pegs"].draw(rng)
+        simulation.place_fixed("pegs", (x, y, 0), yaw)
+        x, y, yaw = self.regions["ring"].draw(rng)
+        simulation.place_free("ring", (x, y, 0.0101), yaw)
         pegs = [PEGS[i] for i in rng.permutation(len(PEGS))]
         self._peg = pegs[0]
         others = [color for color in COLORS if color not in self.goal]
@@ -103,6 +104,10 @@ class InsertOntoSquarePeg(Task):
         over = foot.raised(ABOVE_PEG)
         yield Motion(via=(held.raised(ABOVE),), target=over, gripper=0.0, dwell=4)
         yield Motion(via=(), target=foot.raised(RELEASE), gripper=1.0, dwell=4)
+
+    def clear(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Away: the ring is let go already."""
+        yield Motion(via=(), target=simulation.tool_pose().retracted(RETREAT), gripper=1.0)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:

@@ -1,21 +1,18 @@
 """Plug a USB stick into a computer."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.base import Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
-COMPUTER_AREA = np.array([[0.46, 0.54], [-0.12, 0.12]])
-"""Range of x and y [m] of the middle of the computer's front."""
-STICK_AREA = np.array([[0.29, 0.36], [-0.22, 0.22]])
-"""Range of x and y [m] of the stick."""
-MAX_YAW = np.pi / 8
+YAWS = (-np.pi / 8, np.pi / 8)
 LYING = 0.0216
 """Height [m] of the stick's axis on its pedestal; the port is as high."""
 INSERTED = 0.007
@@ -46,6 +43,9 @@ class InsertUsbInComputer(Task):
 
     name = "insert_usb_in_computer"
     objects: ClassVar[Mapping[str, str]] = {"computer": "computer", "pedestal": "pedestal", "stick": "usb_stick"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"computer": Region((0.46, 0.54), (-0.12, 0.12), YAWS), "stick": Region((0.29, 0.36), (-0.22, 0.22), YAWS)}
+    )
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -61,9 +61,9 @@ class InsertUsbInComputer(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The computer at the back, the stick in front of it, its plug away from the robot."""
-        x, y = rng.uniform(*COMPUTER_AREA.T)
-        simulation.place_fixed("computer", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
-        (x, y), yaw = rng.uniform(*STICK_AREA.T), rng.uniform(-MAX_YAW, MAX_YAW)
+        x, y, yaw = self.regions["computer"].draw(rng)
+        simulation.place_fixed("computer", (x, y, 0), yaw)
+        x, y, yaw = self.regions["stick"].draw(rng)
         simulation.place_fixed("pedestal", (x, y, 0), yaw)
         simulation.place_free("stick", (x, y, LYING), yaw)
 

@@ -1,22 +1,19 @@
 """Move a clothes hanger from one rack to another."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.base import Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
 RACKS = ("left_rack", "right_rack")
-CENTRES = {"left_rack": (0.42, 0.17), "right_rack": (0.42, -0.13)}
-"""Middle [m] of each rack's range of places."""
-SPREAD = (0.07, 0.04)
-"""How far [m] a rack may lie from there."""
-MAX_YAW = np.pi / 9
+YAWS = (-np.pi / 9, np.pi / 9)
 HANGS = 0.0005
 """Height [m] of a hanging hanger's origin over the rod's axis ..."""
 TOLERANCE = (0.025, 0.05, 0.012)
@@ -46,6 +43,12 @@ class MoveHanger(Task):
 
     name = "move_hanger"
     objects: ClassVar[Mapping[str, str]] = dict.fromkeys(RACKS, "rack") | {"hanger": "coat_hanger"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {
+            "left_rack": Region((0.35, 0.49), (0.13, 0.21), YAWS),
+            "right_rack": Region((0.35, 0.49), (-0.17, -0.09), YAWS),
+        }
+    )
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -66,8 +69,8 @@ class MoveHanger(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Racks left and right, the hanger on either."""
         for rack in RACKS:
-            place = CENTRES[rack] + rng.uniform(-1, 1, 2) * SPREAD
-            simulation.place_fixed(rack, (*place, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+            x, y, yaw = self.regions[rack].draw(rng)
+            simulation.place_fixed(rack, (x, y, 0), yaw)
         self._start, self._goal = (RACKS[i] for i in rng.permutation(2))
         simulation.refresh()
         seat = simulation.site(f"{self._start}/seat").position

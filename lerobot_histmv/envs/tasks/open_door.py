@@ -1,12 +1,13 @@
 """Press a door's lever and push the door open."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion, top_down
-from lerobot_histmv.envs.tasks.base import Task, scatter
+from lerobot_histmv.envs.tasks.base import RETREAT, Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -19,9 +20,6 @@ PRESS = 0.045
 """How far the expert presses the lever's end down [m]."""
 TURN = np.radians(30)
 """How far the expert pushes the door [rad]."""
-AREA = np.array([[0.42, 0.5], [-0.12, 0.12]])
-"""Range of x and y [m] of the middle of the door."""
-MAX_YAW = np.pi / 8
 ABOVE = 0.09
 """Height [m] of the via point over the lever's end."""
 BEFORE = 0.05
@@ -46,6 +44,10 @@ class OpenDoor(Task):
 
     name = "open_door"
     objects: ClassVar[Mapping[str, str]] = {"door": "door"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"door": Region((0.42, 0.5), (-0.12, 0.12), (-np.pi / 8, np.pi / 8))}
+    )
+    clear_steps = 1
     variations = ((),)
     initial_gripper = 0.0
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
@@ -62,8 +64,8 @@ class OpenDoor(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Upright, the lever more or less towards the robot; latched."""
-        ((x, y),) = scatter(rng, 1, 0, AREA)
-        simulation.place_fixed("door", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+        x, y, yaw = self.regions["door"].draw(rng)
+        simulation.place_fixed("door", (x, y, 0), yaw)
         self._unlocked = False
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
@@ -90,6 +92,10 @@ class OpenDoor(Task):
         hinge = simulation.position("door/panel")
         pushed = contact.turned((0, 0, 1), TURN, pivot=hinge)
         yield Motion(via=(tip.raised(ABOVE), before), target=pushed, gripper=0.0, dwell=4)
+
+    def clear(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Up, out of the doorway, and open the gripper."""
+        yield Motion(via=(), target=simulation.tool_pose().retracted(RETREAT), gripper=1.0)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:

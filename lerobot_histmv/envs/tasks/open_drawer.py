@@ -1,12 +1,13 @@
 """Open one of a cabinet's three drawers."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, scatter
+from lerobot_histmv.envs.tasks.base import Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -19,23 +20,23 @@ PULL = 0.16
 """How far the expert pulls [m]."""
 APPROACH = 0.10
 """Distance [m] of the via point in front of a handle."""
-AREA = np.array([[0.4, 0.5], [-0.07, 0.03]])
-"""Range of x and y [m] of the middle of the cabinet's front."""
 FACING = -np.pi / 2
 """Yaw [rad] of the cabinet in the middle of its range: drawers come out to the left (+y), where a camera sees them and
 the arm does not have to fold up."""
-MAX_YAW = np.pi / 8
 
 
 class Drawers(Task):
     """What tasks with the cabinet share."""
 
     variations = tuple((drawer,) for drawer in DRAWERS)
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"cabinet": Region((0.4, 0.5), (-0.07, 0.03), (FACING - np.pi / 8, FACING + np.pi / 8))}
+    )
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The cabinet at the right, its front more or less towards the left."""
-        ((x, y),) = scatter(rng, 1, 0, AREA)
-        simulation.place_fixed("cabinet", (x, y, 0), FACING + rng.uniform(-MAX_YAW, MAX_YAW))
+        x, y, yaw = self.regions["cabinet"].draw(rng)
+        simulation.place_fixed("cabinet", (x, y, 0), yaw)
         self.number = DRAWERS.index(self.goal[0])
 
     def opened(self, simulation: "Simulation") -> float:

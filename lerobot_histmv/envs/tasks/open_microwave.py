@@ -1,12 +1,13 @@
 """Open a microwave's door."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, scatter
+from lerobot_histmv.envs.tasks.base import Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -17,9 +18,6 @@ TURN = np.radians(90)
 """How far the expert turns it [rad]."""
 ARC = 6
 """Key poses along the arc."""
-AREA = np.array([[0.5, 0.55], [-0.12, 0.12]])
-"""Range of x and y [m] of the middle of the front."""
-MAX_YAW = np.pi / 8
 ABOVE = 0.12
 
 
@@ -39,6 +37,9 @@ class OpenMicrowave(Task):
 
     name = "open_microwave"
     objects: ClassVar[Mapping[str, str]] = {"microwave": "microwave"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"microwave": Region((0.5, 0.55), (-0.12, 0.12), (-np.pi / 8, np.pi / 8))}
+    )
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -54,8 +55,8 @@ class OpenMicrowave(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """At the back, its front more or less towards the robot."""
-        ((x, y),) = scatter(rng, 1, 0, AREA)
-        simulation.place_fixed("microwave", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+        x, y, yaw = self.regions["microwave"].draw(rng)
+        simulation.place_fixed("microwave", (x, y, 0), yaw)
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Remember whether the bar was grasped."""

@@ -1,12 +1,13 @@
 """Put the named shape through its hole."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, nearest_turn, scatter
+from lerobot_histmv.envs.tasks.base import Region, Task, nearest_turn, scatter
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -19,16 +20,14 @@ SYMMETRY = {
     "cross": np.pi / 2,
 }
 """Shape -> the least turn [rad] that leaves it as it is; a cylinder need not be turned at all."""
-SORTER_AREA = np.array([[0.47, 0.55], [-0.06, 0.06]])
-"""Range of x and y [m] of the sorter's centre."""
-MAX_YAW = np.pi / 9
-SHAPES_AREA = np.array([[0.28, 0.39], [-0.28, 0.28]])
-"""Range of x and y [m] in which the shapes lie."""
-APART = 0.085
+APART = 0.07
+"""Least distance between the shapes' centres [m]."""
 INSIDE = np.array([0.03, 0.15, 0.027])
 """Half extents [m] of the sorter's inside."""
 IN_HOLE = 0.005
 """Height [m] of a shape's centre over the lid's when the expert lets it go: its foot is in the hole."""
+MOUTH = 0.02
+"""Height [m] over that of the last key pose before."""
 ABOVE = 0.12
 
 
@@ -43,12 +42,18 @@ class PlaceShapeInShapeSorter(Task):
     | | outlines straight boards do not leave open) |
     | success | the named shape is inside the box |
     | failure | wrong object: another shape was held |
-    | macro steps | 5: above, grasp, up, over the hole, into it |
+    | macro steps | 6: above, grasp, up, over the hole, at its mouth, into it |
     | difficulty | 3 mm of play on each side, and the shape must be turned to fit |
     """
 
     name = "place_shape_in_shape_sorter"
     objects: ClassVar[Mapping[str, str]] = {"sorter": "shape_sorter"} | {shape: f"shape_{shape}" for shape in SYMMETRY}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {
+            "sorter": Region((0.47, 0.55), (-0.06, 0.06), (-np.pi / 9, np.pi / 9)),
+            "shapes": Region((0.28, 0.39), (-0.28, 0.28)),
+        }
+    )
     variations = tuple((shape,) for shape in SYMMETRY)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -64,9 +69,10 @@ class PlaceShapeInShapeSorter(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The box at the back, the shapes in front of it."""
-        x, y = rng.uniform(*SORTER_AREA.T)
-        simulation.place_fixed("sorter", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
-        for shape, (x, y) in zip(SYMMETRY, scatter(rng, len(SYMMETRY), APART, SHAPES_AREA), strict=True):
+        x, y, yaw = self.regions["sorter"].draw(rng)
+        simulation.place_fixed("sorter", (x, y, 0), yaw)
+        places = scatter(rng, len(SYMMETRY), APART, self.regions["shapes"].area)
+        for shape, (x, y) in zip(SYMMETRY, places, strict=True):
             simulation.place_free(shape, (x, y, 0.0121), rng.uniform(-np.pi, np.pi))
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
@@ -92,9 +98,10 @@ class PlaceShapeInShapeSorter(Task):
         turn = 0.0 if shape == "cylinder" else simulation.yaw("sorter") - simulation.yaw(shape)
         turned = simulation.tool_pose().turned((0, 0, 1), nearest_turn(turn, SYMMETRY[shape]), pivot=held)
         drop = turned.moved(simulation.position(f"sorter/{shape}") + np.array([0, 0, IN_HOLE]) - held)
-        yield Motion(via=(grasp.raised(ABOVE), drop.raised(ABOVE)), target=drop, gripper=1.0, dwell=6)
+        over = (drop.raised(ABOVE), drop.raised(MOUTH))
+        yield Motion(via=(grasp.raised(ABOVE), *over), target=drop, gripper=1.0, dwell=6)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:
-        """Above, grasp, up, over the hole, into it."""
-        return 5
+        """Above, grasp, up, over the hole, at its mouth, into it."""
+        return 6

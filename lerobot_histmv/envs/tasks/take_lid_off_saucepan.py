@@ -1,23 +1,24 @@
 """Lift the lid off a saucepan."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, nearest_turn, scatter
+from lerobot_histmv.envs.tasks.base import RETREAT, Region, Task, nearest_turn
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
 
-AREA = np.array([[0.36, 0.52], [-0.2, 0.2]])
-"""Range of x and y [m] of the pan's centre."""
 SUCCESS_HEIGHT = 0.15
 """The region of success begins this far above the pan's rim [m]."""
 LIFT = 0.22
 """How far the expert lifts [m]."""
 ABOVE = 0.12
+LID_ON_TABLE = 0.011
+"""Height [m] of the lid's origin when it lies on the table."""
 
 
 class TakeLidOffSaucepan(Task):
@@ -36,6 +37,11 @@ class TakeLidOffSaucepan(Task):
 
     name = "take_lid_off_saucepan"
     objects: ClassVar[Mapping[str, str]] = {"saucepan": "saucepan", "lid": "lid"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"saucepan": Region((0.36, 0.52), (-0.2, 0.2), (-np.pi, np.pi)), "rest": Region((0.3, 0.3), (0.0, 0.0))}
+    )
+    """``rest`` is where ``clear`` puts the lid down."""
+    clear_steps = 3
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -51,8 +57,9 @@ class TakeLidOffSaucepan(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Anywhere in the area; the handle points anywhere, and so does the lid's knob."""
-        ((x, y),) = scatter(rng, 1, 0, AREA)
-        simulation.place_fixed("saucepan", (x, y, 0), rng.uniform(-np.pi, np.pi))
+        x, y, yaw = self.regions["saucepan"].draw(rng)
+        simulation.place_fixed("saucepan", (x, y, 0), yaw)
+        self._rest = self.regions["rest"].draw(rng)
         simulation.place_free("lid", (x, y, 0.068), rng.uniform(-np.pi, np.pi))
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
@@ -75,6 +82,16 @@ class TakeLidOffSaucepan(Task):
         grasp = knob.turned((0, 0, 1), nearest_turn(yaw, np.pi) - yaw)
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
         yield Motion(via=(), target=grasp.raised(LIFT), gripper=0.0, dwell=4)
+
+    def clear(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Put the lid down on the table."""
+        x, y, _ = self._rest
+        tool = simulation.tool_pose()
+        held = simulation.position("lid")
+        down = tool.moved((x - held[0], y - held[1], LID_ON_TABLE - held[2]))
+        over = tool.moved((x - held[0], y - held[1], 0))
+        yield Motion(via=(over,), target=down, gripper=1.0)
+        yield Motion(via=(), target=down.retracted(RETREAT), gripper=1.0)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:

@@ -1,12 +1,13 @@
 """Open one of the tap's two knobs."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task, nearest_turn, scatter
+from lerobot_histmv.envs.tasks.base import Region, Task, nearest_turn
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -15,11 +16,8 @@ OPEN = np.pi / 2
 """A knob is open once it has turned this far [rad], as in RLBench."""
 TURN = 1.75
 """How far the expert turns it [rad]."""
-MAX_YAW = np.pi / 4
 ABOVE = 0.12
 """Height [m] of the via point over a knob."""
-AREA = np.array([[0.36, 0.52], [-0.18, 0.18]])
-"""Range of x and y [m] of the tap's post."""
 DIRECTIONS = {"left": 1, "right": -1}
 """Knob -> sense of turning about z in which it opens."""
 
@@ -40,6 +38,9 @@ class TurnTap(Task):
 
     name = "turn_tap"
     objects: ClassVar[Mapping[str, str]] = {"tap": "tap"}
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"tap": Region((0.36, 0.52), (-0.18, 0.18), (-np.pi / 4, np.pi / 4))}
+    )
     variations = (("left",), ("right",))
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -59,8 +60,8 @@ class TurnTap(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Anywhere in the area, with the spout more or less towards the robot."""
-        ((x, y),) = scatter(rng, 1, 0, AREA)
-        simulation.place_fixed("tap", (x, y, 0), rng.uniform(-MAX_YAW, MAX_YAW))
+        x, y, yaw = self.regions["tap"].draw(rng)
+        simulation.place_fixed("tap", (x, y, 0), yaw)
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Remember which knob was grasped."""

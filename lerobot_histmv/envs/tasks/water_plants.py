@@ -1,12 +1,13 @@
 """Water a plant with a watering can."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.envs.tasks.base import RETREAT, Region, Task
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -45,6 +46,10 @@ class WaterPlants(Task):
 
     name = "water_plants"
     objects: ClassVar[Mapping[str, str]] = {"can": "watering_can", "plant": "plant"} | dict.fromkeys(DROPS, "drop")
+    regions: Mapping[str, Region] = MappingProxyType(
+        {"can": Region((0.32, 0.5), (-0.24, 0.24)), "plant": Region((0.38, 0.52), (-0.24, 0.24))}
+    )
+    clear_steps = 4
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -61,7 +66,7 @@ class WaterPlants(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Can and plant anywhere, the spout more or less towards the plant; no drop in sight."""
         while True:
-            plant, can = rng.uniform([[0.38, -0.24], [0.32, -0.24]], [[0.52, 0.24], [0.5, 0.24]])
+            plant, can = (np.array(self.regions[name].draw(rng)[:2]) for name in ("plant", "can"))
             if np.linalg.norm(plant - can) > APART:
                 break
         simulation.place_fixed("plant", (*plant, 0))
@@ -94,9 +99,16 @@ class WaterPlants(Task):
         tool, spout = simulation.tool_pose(), simulation.site("can/spout").position
         goal = simulation.position("plant") + np.array([0, 0, SPOUT_HEIGHT])
         upright = tool.moved(goal - spout)
+        self._way_back = (upright, tool.raised(ABOVE), tool)
         across = simulation.rotation("can")[:, 1]
         half, tilted = (upright.turned(across, share * TILT, pivot=goal) for share in (0.5, 1))
         yield Motion(via=(tool.raised(ABOVE), upright, half), target=tilted, gripper=0.0, dwell=8)
+
+    def clear(self, simulation: "Simulation") -> Iterator[Motion]:
+        """Put the can back where it was."""
+        upright, above, stand = self._way_back
+        yield Motion(via=(upright, above), target=stand, gripper=1.0)
+        yield Motion(via=(), target=stand.retracted(RETREAT), gripper=1.0)
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:
