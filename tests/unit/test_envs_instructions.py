@@ -29,7 +29,7 @@ def test_an_instruction_names_its_colours_in_order_and_no_other(name: str) -> No
             for sentence in task.instructions(variation, split):
                 words = sentence.replace(",", "").split()
                 assert tuple(word for word in words if word in COLORS) == tuple(w for w in goal if w in COLORS)
-                assert not set(words) & set(HELD_OUT_COLORS)
+                assert not set(words) & set(HELD_OUT_COLORS) or name == "pick_and_lift_unseen_colors"
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -10,6 +10,7 @@ from lerobot_histmv.envs.tasks.open_door import OpenDoor
 from lerobot_histmv.envs.tasks.open_drawer import OpenDrawer
 from lerobot_histmv.envs.tasks.open_microwave import OpenMicrowave
 from lerobot_histmv.envs.tasks.pick_and_lift import PickAndLift
+from lerobot_histmv.envs.tasks.pick_and_lift_unseen import PickAndLiftUnseenColors, PickAndLiftUnseenShapes
 from lerobot_histmv.envs.tasks.pick_up_cup import PickUpCup
 from lerobot_histmv.envs.tasks.place_shape_in_shape_sorter import PlaceShapeInShapeSorter
 from lerobot_histmv.envs.tasks.push_buttons import PushButtons
@@ -42,6 +43,8 @@ TASKS: dict[str, type[Task]] = {
         MoveHanger,
         InsertUsbInComputer,
         PlaceShapeInShapeSorter,
+        PickAndLiftUnseenColors,
+        PickAndLiftUnseenShapes,
         Home,
         Kitchen,
         Assembly,

@@ -1,6 +1,7 @@
 """Tasks whose instruction names objects by their colours."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -19,33 +20,45 @@ COLORS = {
 }
 """The six colours of the tasks (RGB)."""
 HELD_OUT_COLORS = {"orange": (0.95, 0.45, 0.05), "pink": (0.95, 0.45, 0.65), "white": (0.92, 0.92, 0.92)}
-"""Colours that no task uses, kept for tests of generalisation."""
+"""Colours that only tests of generalisation use."""
 
 
 class ColorTask(Task):
     """A task about like objects of different colours.
 
-    A variation is a sequence of colours. ``slots`` lists the objects: those of the named colours, in order, then the
+    A variation names colours in order. ``slots`` lists the objects: those of the named colours, in order, then the
     distractors. Every description in ``objects`` has a material ``paint``.
     """
+
+    palette: ClassVar[Mapping[str, tuple[float, float, float]]] = COLORS
+    """Colours of targets and distractors."""
+
+    @property
+    def colors(self) -> list[str]:
+        """Colours that the variation names, in order."""
+        return [word for word in self.goal if word in self.palette]
+
+    def candidates(self) -> list[str]:
+        """Objects of the episode."""
+        return list(self.objects)
 
     def reset(self, simulation: "Simulation", variation: int, rng: np.random.Generator) -> None:
         """Place and colour the objects."""
         self.goal = self.variations[variation]
-        names = list(self.objects)
+        names = self.candidates()
         self.slots = [names[i] for i in rng.permutation(len(names))]
         super().reset(simulation, variation, rng)
-        others = [color for color in COLORS if color not in self.goal]
+        others = [color for color in self.palette if color not in self.goal]
         drawn = rng.choice(len(others), len(self.distractors), replace=False)
-        for slot, color in zip(self.slots, [*self.goal, *(others[i] for i in drawn)], strict=True):
-            simulation.paint(slot, COLORS[color])
+        for slot, color in zip(self.slots, [*self.colors, *(others[i] for i in drawn)], strict=True):
+            simulation.paint(slot, self.palette[color])
 
     @property
     def targets(self) -> list[str]:
         """Objects that the instruction names, in order."""
-        return self.slots[: len(self.goal)]
+        return self.slots[: len(self.colors)]
 
     @property
     def distractors(self) -> list[str]:
         """Objects that the instruction does not name."""
-        return self.slots[len(self.goal) :]
+        return self.slots[len(self.colors) :]

@@ -62,6 +62,10 @@ class PickAndLift(ColorTask):
         for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
             simulation.place_free(name, (x, y, CUBE_HEIGHT), rng.uniform(-np.pi, np.pi))
 
+    def symmetry(self) -> float:
+        """Least turn [rad] that leaves a block as it is."""
+        return np.pi / 2
+
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Remember what has been grasped."""
         self.grasps.watch(simulation, gripper, self.slots)
@@ -78,7 +82,7 @@ class PickAndLift(ColorTask):
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Down over the cube, grasp, up and back towards the robot."""
         cube = self.targets[0]
-        grasp = top_down(simulation.position(cube), nearest_turn(simulation.yaw(cube), np.pi / 2))
+        grasp = top_down(simulation.position(cube), nearest_turn(simulation.yaw(cube), self.symmetry()))
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
         carry = Pose(np.array(CARRY), grasp.quaternion)
         yield Motion(via=(grasp.raised(ABOVE),), target=carry, gripper=0.0, dwell=4)
