@@ -36,7 +36,7 @@ class Chain(Task):
     """
 
     stages: ClassVar[tuple[Stage, ...]]
-    variations = ((),)
+    variations: ClassVar[tuple[tuple[str, ...], ...]] = ((),)
 
     def __init_subclass__(cls) -> None:
         """Collect the stages' objects."""

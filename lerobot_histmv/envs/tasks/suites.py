@@ -44,8 +44,8 @@ SUITES: dict[str, tuple[str, ...]] = {
     "unseen": ("pick_and_lift_unseen_colors", "pick_and_lift_unseen_shapes"),
     "all": tuple(name for name in TASKS if not issubclass(TASKS[name], Chain) and "unseen" not in name),
 }
-"""Paper, section 4.2: three sets that mix simple and complex tasks, up to three variations each. Of its first set,
-turning a tap and stacking cups are known, the rest is our choice. Section 4.4: what training does not show. And all tasks but
+"""Paper, section 4.2: three sets that mix simple and complex tasks, up to three variations each (of its first
+set, turning a tap and stacking cups are known, the rest is our choice). Section 4.4: what training does not show. And all tasks but
 these and the long-horizon ones."""
 
 
@@ -78,7 +78,7 @@ def expand(names: str) -> list[str]:
     Raises:
         ValueError: a name is none of these, or one is there twice.
     """
-    found = []
+    found: list[str] = []
     for name in (part.strip() for part in names.split(",")):
         if name.partition(".")[0] not in TASKS and name not in SUITES:
             raise ValueError(f"task is {name!r}; accepted are {', '.join(TASKS)}, and the suites {', '.join(SUITES)}")
