@@ -44,9 +44,9 @@ SUITES: dict[str, tuple[str, ...]] = {
     "unseen": ("pick_and_lift_unseen_colors", "pick_and_lift_unseen_shapes"),
     "all": tuple(name for name in TASKS if not issubclass(TASKS[name], Chain) and "unseen" not in name),
 }
-"""Paper, section 4.2: three sets that mix simple and complex tasks, up to three variations each (of its first
-set, turning a tap and stacking cups are known, the rest is our choice). Section 4.4: what training does not show. And all tasks but
-these and the long-horizon ones."""
+"""Paper, section 4.2: three sets that mix simple and complex tasks, up to three variations each. Of its first set,
+turning a tap and stacking cups are known, the rest is our choice. Section 4.4: what training does not show. And all
+tasks but these and the long-horizon ones."""
 
 
 def variation_names(name: str) -> list[str]:

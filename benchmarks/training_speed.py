@@ -1,0 +1,67 @@
+"""Seconds per step of ``lerobot-train`` with the default preset, and the share of it that waits for data.
+
+    python benchmarks/training_speed.py KEYFRAMED_ROOT [--steps=60] [--threads=2]
+
+The first 20 steps, in which the frame cache fills and memory is allocated, are left out. Results are filed under the
+dataset's name in ``benchmarks/results/training_speed.json``; they mean something on an idle machine only.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import mean
+
+from dataset_tools import config_files
+from dataset_tools.shards import write_json
+
+RESULTS = Path(__file__).parent / "results" / "training_speed.json"
+WARM_UP = 20
+PRESET = "train/default"
+
+
+def train(root: Path, steps: int, threads: int) -> str:
+    """What a short training logs."""
+    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(threads)}
+    with tempfile.TemporaryDirectory() as folder:
+        command = (
+            str(Path(sys.executable).with_name("lerobot-train")), f"--config_path={config_files.find(PRESET)}",
+            "--policy.device=cpu", "--dataset.repo_id=local/speed", f"--dataset.root={root}",
+            f"--output_dir={folder}/train", f"--steps={steps}", "--log_freq=10", "--save_checkpoint=false",
+        )  # fmt: skip
+        found = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+    return found.stdout + found.stderr
+
+
+def main() -> None:
+    """Train for a minute and read the log."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("root", type=Path)
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    args = parser.parse_args()
+    load = os.getloadavg()[0]
+    logged = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", train(args.root, args.steps, args.threads))
+    updates, waits = zip(*[map(float, pair) for pair in logged[WARM_UP // 10 :]], strict=True)
+    preset_steps = int(re.findall(r"^steps: (\d+)", config_files.find(PRESET).read_text(), re.MULTILINE)[0])
+    seconds = mean(updates) + mean(waits)
+    result = {
+        "threads": args.threads,
+        "load_before": round(load, 1),
+        "steps_measured": 10 * len(updates),
+        "seconds_per_step": round(seconds, 3),
+        "share_waiting_for_data": round(mean(waits) / seconds, 3),
+        "preset_minutes": round(seconds * preset_steps / 60, 1),
+    }
+    known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+    name = args.root.resolve().parent.name
+    write_json(RESULTS, known | {f"{name}, {args.threads} threads": result})
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
