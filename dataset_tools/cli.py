@@ -27,6 +27,7 @@ class Command:
 
 
 COMMANDS = {
+    "view": Command("dataset_tools.view", "watch the scripted expert of a task, in a window or as a video"),
     "record": Command(
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),

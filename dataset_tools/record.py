@@ -19,7 +19,8 @@ from dataset_tools.record_settings import SEED_LIMIT, RecordSettings
 from dataset_tools.record_worker import WorkerSetup
 from dataset_tools.shards import Outcome, made_attempts, missing_attempts, read_outcomes, write_json
 from lerobot_histmv.envs import make
-from lerobot_histmv.envs.interface import CAMERA_NAMES, check_options
+from lerobot_histmv.envs.disturbances import Disturbances
+from lerobot_histmv.envs.interface import CAMERA_NAMES
 from lerobot_histmv.envs.tasks import suites
 
 
@@ -37,6 +38,8 @@ class RecordEnvConfig:
     cameras: list[str] = field(default_factory=lambda: list(CAMERA_NAMES))
     # Side of the square images, in pixels.
     image_size: int = 128
+    # What makes episodes harder, such as --env.disturbances.lighting=1.
+    disturbances: Disturbances = field(default_factory=Disturbances)
 
 
 @dataclass
@@ -75,9 +78,10 @@ def run(config: RecordConfig) -> None:
         "image_size": settings.image_size,
         "render_size": settings.image_size,
         "variation": settings.variation,
+        "disturbances": settings.disturbances,
     }
     for task in settings.tasks:
-        check_options(task, **options)
+        make(task, **options)
     make_env = partial(make, **options)
     root = Path(config.root).expanduser().resolve() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
@@ -105,6 +109,7 @@ def checked_settings(config: RecordConfig) -> RecordSettings:
         image_size=config.env.image_size,
         fps=config.fps,
         seed=config.seed,
+        disturbances=config.env.disturbances,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.motion import TICK
 
 CONTROL_RATE = round(1 / TICK)
@@ -25,6 +26,7 @@ class RecordSettings:
         image_size: side of the images [pixels].
         fps: frames per second; divides ``CONTROL_RATE``.
         seed: scene seed of the first attempt, below ``SEED_LIMIT``.
+        disturbances: what makes episodes harder.
     """
 
     tasks: tuple[str, ...]
@@ -33,6 +35,7 @@ class RecordSettings:
     image_size: int
     fps: int
     seed: int
+    disturbances: Disturbances = CLEAN
 
     def __post_init__(self) -> None:
         accepted = [rate for rate in range(1, CONTROL_RATE + 1) if CONTROL_RATE % rate == 0]

@@ -1,9 +1,11 @@
 """Processors of the HistMV policy: what enters is checked, so that no wrong unit or order is trained on silently."""
 
+import logging
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
@@ -36,21 +38,26 @@ METRE_LIMIT = 20.0
 class CheckInputStep(ProcessorStep):
     """Refuse observations and targets that the policy would silently misread; depth becomes float32 millimetres.
 
+    A camera without any depth is left out of the decisions it is missing in, with one warning, as long as another one
+    sees something.
+
     Args:
         cameras: the policy's views.
     """
 
     cameras: list[str] = field(default_factory=list)
+    _warned: set[str] = field(default_factory=set, init=False, repr=False)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Check one transition.
 
         Raises:
-            ValueError: a camera is missing, numbers are not finite, a view has no valid depth, depth is in metres,
-                or a quaternion is not unit.
+            ValueError: a camera is missing, numbers are not finite, no view has valid depth, depth is in metres, or a
+                quaternion is not unit.
         """
         new = transition.copy()
         observation = dict(new[TransitionKey.OBSERVATION] or {})
+        seeing = {}
         for camera in self.cameras:
             for key in (keys.rgb_key(camera), keys.depth_key(camera)):
                 if key not in observation:
@@ -59,8 +66,9 @@ class CheckInputStep(ProcessorStep):
                     )
             key = keys.depth_key(camera)
             observation[key] = observation[key].to(torch.float32)
-            check_depth(key, observation[key])
+            seeing[camera] = check_depth(key, observation[key])
             check_colours(keys.rgb_key(camera), observation[keys.rgb_key(camera)])
+        self._check_seeing(seeing)
         for key in (keys.STATE, keys.INTRINSICS, keys.EXTRINSICS):
             if key not in observation:
                 raise ValueError(f"observation lacks {key!r}")
@@ -75,6 +83,16 @@ class CheckInputStep(ProcessorStep):
             check_unit(keys.ACTION, action)
         new[TransitionKey.OBSERVATION] = observation
         return new
+
+    def _check_seeing(self, seeing: dict[str, Bool[Tensor, "*steps"]]) -> None:
+        if seeing and not torch.stack(list(seeing.values())).any(dim=0).all():
+            raise ValueError(
+                f"no camera of {self.cameras} has any valid depth (all 0) in some step; repair or replace the sensors"
+            )
+        for camera, sees in seeing.items():
+            if camera not in self._warned and not sees.all():
+                self._warned.add(camera)
+                logging.warning("%s has images without any depth (all 0): decisions leave them out", camera)
 
     def get_config(self) -> dict[str, Any]:
         """What the checkpoint stores."""
@@ -93,19 +111,21 @@ def check_finite(key: str, values: Tensor) -> None:
         raise ValueError(f"{key} holds NaN or infinity; run `histmv doctor` on the dataset or check the sensor")
 
 
-def check_depth(key: str, depth: Tensor) -> None:
-    """Raise ValueError if depth [mm] is not finite, has no valid pixel in some image, or seems to be in metres."""
-    nearest_to_top = depth.flatten(-3).amax(dim=-1)
-    check_finite(key, nearest_to_top)
-    if (nearest_to_top <= 0).any():
+def check_depth(key: str, depth: Float[Tensor, "*steps 1 y x"]) -> Bool[Tensor, "*steps"]:
+    """Which images have any valid depth [mm].
+
+    Raises:
+        ValueError: depth is not finite, or seems to be in metres.
+    """
+    largest = depth.flatten(-3).amax(dim=-1)
+    check_finite(key, largest)
+    sees = largest > 0
+    if (largest[sees] < METRE_LIMIT).any():
+        found = float(largest[sees].min())
         raise ValueError(
-            f"{key} has an image without any valid depth (all 0); leave the camera out or repair the sensor"
+            f"{key} reaches at most {found:.3g}, which looks like metres; histmv expects millimetres (0 = invalid)"
         )
-    if (nearest_to_top < METRE_LIMIT).any():
-        largest = float(nearest_to_top.min())
-        raise ValueError(
-            f"{key} reaches at most {largest:.3g}, which looks like metres; histmv expects millimetres (0 = invalid)"
-        )
+    return sees
 
 
 def check_colours(key: str, colours: Tensor) -> None:

@@ -15,7 +15,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_histmv import keys
 from lerobot_histmv.envs import UR5Env, make
-from lerobot_histmv.envs.interface import ACTION_SIZE, CAMERA_NAMES, STATE_SIZE, check_options
+from lerobot_histmv.envs.disturbances import Disturbances
+from lerobot_histmv.envs.interface import ACTION_SIZE, CAMERA_NAMES, STATE_SIZE
 from lerobot_histmv.envs.processor_ur5 import UR5DepthProcessorStep
 from lerobot_histmv.envs.tasks import suites
 
@@ -34,6 +35,7 @@ class UR5EnvConfig(EnvConfig):
         variation: number of the variation to use always; None draws one per episode.
         instruction_split: paraphrases to draw from, ``train`` or ``held_out``.
         render_size: width and height of video frames [pixels].
+        disturbances: strengths of what makes episodes harder, such as ``--env.disturbances.depth=1``.
         max_parallel_tasks: must stay 1: LeRobot would share one policy, and so one history, between tasks.
     """
 
@@ -45,11 +47,12 @@ class UR5EnvConfig(EnvConfig):
     variation: int | None = None
     instruction_split: str = "train"
     render_size: int = 256
+    disturbances: Disturbances = field(default_factory=Disturbances)
 
     def __post_init__(self) -> None:
         """Check the options and describe observations and actions."""
         for task in self.tasks:
-            check_options(task, **self.gym_kwargs)
+            UR5Env(task, **self.gym_kwargs)
         if self.fps != UR5Env.metadata["render_fps"]:
             raise ValueError(f"env.fps is {self.fps}; the simulated robot is controlled at 20 Hz")
         if self.max_parallel_tasks != 1:
@@ -89,6 +92,7 @@ class UR5EnvConfig(EnvConfig):
             "variation": self.variation,
             "instruction_split": self.instruction_split,
             "render_size": self.render_size,
+            "disturbances": self.disturbances,
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:

@@ -33,6 +33,8 @@ class Controller:
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self.on_tick: OnTick | None = None
+        self.gripper_delay = 0
+        """Ticks until the gripper takes a command."""
         self.ticks = 0
         self.reset(1.0)
 
@@ -74,8 +76,10 @@ class Controller:
         if plan is not None and self.follow(plan):
             self._arrive(motion.target)
         if motion.gripper != self.gripper:
+            late = min(self.gripper_delay, GRIPPER_TICKS)
+            self.hold(late)
             self.gripper = motion.gripper
-            self.hold(GRIPPER_TICKS)
+            self.hold(GRIPPER_TICKS - late)
         self.hold(motion.dwell)
         return plan is not None
 

@@ -20,6 +20,7 @@ FEED_FORWARD = 0.2
 REFERENCE_STEPS = 5
 """Physics steps between updates of the actuators' reference inside a tick."""
 GRIPPER_CLOSED_CONTROL = 255.0
+FREE = mujoco.mjtJoint.mjJNT_FREE
 DRIVER_CLOSED = 0.8
 """Angle [rad] of the finger drivers when closed."""
 
@@ -141,9 +142,16 @@ class Simulation:
         partners = self._touching(self._geoms(name))
         return all(partners & pad for pad in self._pads)
 
-    def touch(self, first: str, second: str) -> bool:
-        """Whether two objects or parts touch each other."""
-        return bool(self._touching(self._geoms(first)) & self._geoms(second))
+    def is_alone(self, name: str) -> bool:
+        """Whether an object, where it was just placed or rests, touches nothing but the table."""
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return self._touching(self._geoms(name)) <= {self.model.geom("table").id}
+
+    def loose(self, names: Iterable[str]) -> list[str]:
+        """Those of the objects that lie about: they have a free joint."""
+        joints = {name: _full(name, "joint") for name in names}
+        known = {self.model.joint(i).name for i in range(self.model.njnt) if self.model.jnt_type[i] == FREE}
+        return [name for name, joint in joints.items() if joint in known]
 
     def _touching(self, geoms: frozenset[int]) -> set[int]:
         """Geoms in contact with any of ``geoms``."""

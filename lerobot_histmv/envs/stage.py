@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8, UInt16
 
 from lerobot_histmv.envs.camera import Renderer, samples_for
 from lerobot_histmv.envs.controller import Controller
+from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
+from lerobot_histmv.envs.disturber import Disturber
 from lerobot_histmv.envs.motion import Motion, Pose
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import Task
@@ -16,25 +19,48 @@ SETTLE_TICKS = 10
 """Ticks before an episode starts: objects come to rest and the gripper takes its initial command."""
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera gives.
+
+    Args:
+        image: colour.
+        depth: distance along the optical axis [mm], 0 invalid.
+        intrinsics: fx, fy, cx, cy [pixels].
+        extrinsics: ``T_world_cam`` (OpenCV axes).
+    """
+
+    image: UInt8[np.ndarray, "h w 3"]
+    depth: UInt16[np.ndarray, "h w 1"]
+    intrinsics: Float[np.ndarray, " 4"]
+    extrinsics: Float[np.ndarray, "3 4"]
+
+
 class Stage:
     """Everything behind an environment that cannot be pickled.
 
     Args:
         task: what is to be done in it.
+        disturbances: what makes it harder.
         image_size: largest image side [pixels] that will be rendered.
     """
 
-    def __init__(self, task: type[Task], image_size: int) -> None:
+    def __init__(self, task: type[Task], image_size: int, disturbances: Disturbances) -> None:
         self.task = task()
-        self.simulation = Simulation(self.task.objects, samples_for(image_size))
+        self.simulation = Simulation({**self.task.objects, **disturbances.objects}, samples_for(image_size))
         self.controller = Controller(self.simulation)
         self.renderer = Renderer(self.simulation.model)
+        loose = self.simulation.loose(self.task.objects)
+        self.disturber = None if disturbances == CLEAN else Disturber(disturbances, self.simulation, loose)
         self.simulation.after_tick.append(lambda: self.task.watch(self.simulation, self.controller.gripper))
 
-    def reset(self, variation: int, rng: np.random.Generator) -> None:
-        """A new scene, at rest."""
+    def reset(self, variation: int, rng: np.random.Generator, cameras: tuple[str, ...]) -> None:
+        """A new scene, at rest; ``cameras`` are those that will look at it."""
         self.simulation.reset()
         self.task.reset(self.simulation, variation, rng)
+        if self.disturber is not None:
+            self.disturber.reset(int(rng.integers(2**63)), cameras)
+            self.controller.gripper_delay = self.disturber.gripper_delay
         self.simulation.refresh()
         self.controller.reset(self.task.initial_gripper)
         self.controller.hold(SETTLE_TICKS)
@@ -51,9 +77,29 @@ class Stage:
 
     def go(self, pose: Pose, gripper: float, servo: bool) -> bool:
         """One step of the environment: a whole macro step, or one tick towards ``pose``. False if out of reach."""
+        if self.disturber is not None:
+            self.disturber.begin_step()
+            pose = self.disturber.act(pose)
         if servo:
             return self.controller.servo(pose, gripper)
         return self.controller.execute(Motion(via=(), target=pose, gripper=gripper))
+
+    def look(self, camera: str, size: int) -> View:
+        """A camera's picture and calibration."""
+        image, depth = self.renderer.render(self.simulation.data, camera, size)
+        view = View(
+            image,
+            depth,
+            self.renderer.intrinsics(camera, size),
+            self.renderer.extrinsics(self.simulation.data, camera),
+        )
+        if self.disturber is None:
+            return view
+        return View(
+            *self.disturber.see(camera, view.image, view.depth),
+            self.disturber.intrinsics(camera, view.intrinsics),
+            self.disturber.extrinsics(camera, view.extrinsics),
+        )
 
     def state(self) -> Float[np.ndarray, " 14"]:
         """Measured tool pose (7), gripper opening (1 open), joint angles [rad] (6); float32."""

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from lerobot_histmv import keys
 from lerobot_histmv.envs import interface
+from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.interface import CAMERA_NAMES
 from lerobot_histmv.envs.motion import Motion, Tick
 from lerobot_histmv.envs.tasks import suites
@@ -88,7 +89,8 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         variation: the one variation to use, or None to draw it from the seed.
         instruction_split: paraphrases to draw from, ``train`` or ``held_out``.
         render_mode: ``rgb_array``.
-        render_size: side of what ``render`` and ``substep_frames`` return [pixels].
+        render_size: side of what ``render`` and ``substep_frames`` return [pixels]; they show the scene undisturbed.
+        disturbances: what makes episodes harder than clean ones.
     """
 
     metadata = {"render_modes": list(interface.RENDER_MODES), "render_fps": 20}  # noqa: RUF012
@@ -103,6 +105,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         instruction_split: str = "train",
         render_mode: str = "rgb_array",
         render_size: int = 256,
+        disturbances: Disturbances = CLEAN,
     ) -> None:
         interface.check_options(
             task, cameras, image_size, control, variation, instruction_split, render_mode, render_size
@@ -113,6 +116,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         self.image_size, self.render_size = image_size, render_size
         self.control, self.render_mode = control, render_mode
         self.instruction_split = instruction_split
+        self.disturbances = disturbances
         self.record_substeps = False
         self.action_space = interface.action_space()
         self.observation_space = interface.observation_space(self.cameras, image_size)
@@ -163,10 +167,10 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         if self._stage is None:
             from lerobot_histmv.envs.stage import Stage
 
-            self._stage = Stage(self.task_class, max(self.image_size, self.render_size))
+            self._stage = Stage(self.task_class, max(self.image_size, self.render_size), self.disturbances)
         self._steps, self._out_of_reach = 0, False
         self._frames: list[UInt8[np.ndarray, "h w 3"]] = []
-        self.stage.reset(self.variation, rng)
+        self.stage.reset(self.variation, rng, self.cameras)
         self._capture()
         return self.observe(), self._info(ended=False)
 
@@ -203,19 +207,13 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
 
     def observe(self) -> Observation:
         """The current observation, freshly rendered."""
-        stage, depths, pixels, intrinsics, extrinsics = self.stage, {}, {}, [], []
-        for camera in self.cameras:
-            data = stage.simulation.data
-            pixels[camera], depth = stage.renderer.render(data, camera, self.image_size)
-            depths[f"{camera}{keys.DEPTH_SUFFIX}"] = depth
-            intrinsics.append(stage.renderer.intrinsics(camera, self.image_size))
-            extrinsics.append(stage.renderer.extrinsics(data, camera).ravel())
+        views = {camera: self.stage.look(camera, self.image_size) for camera in self.cameras}
         return {
-            "pixels": pixels,
-            "agent_pos": stage.state(),
-            **depths,
-            "camera_intrinsics": np.concatenate(intrinsics).astype(np.float32),
-            "camera_extrinsics": np.concatenate(extrinsics).astype(np.float32),
+            "pixels": {camera: view.image for camera, view in views.items()},
+            "agent_pos": self.stage.state(),
+            **{f"{camera}{keys.DEPTH_SUFFIX}": view.depth for camera, view in views.items()},
+            "camera_intrinsics": np.concatenate([view.intrinsics for view in views.values()]).astype(np.float32),
+            "camera_extrinsics": np.concatenate([view.extrinsics.ravel() for view in views.values()], dtype=np.float32),
         }
 
     def expert(self) -> Iterator[Motion]:

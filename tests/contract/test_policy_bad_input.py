@@ -148,6 +148,12 @@ def scale(key: str, factor: float) -> Callable[[dict[str, Any]], None]:
     return lambda batch: batch.update({key: batch[key] * factor})
 
 
+def blind(batch: dict[str, Any]) -> None:
+    """No camera has depth."""
+    for camera in ("front", "wrist"):
+        scale(keys.depth_key(camera), 0.0)(batch)
+
+
 SPOILT_OBSERVATIONS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "missing camera": (lambda b: b.pop(FRONT), r"lacks 'observation\.images\.front'.*\['front', 'wrist'\]"),
     "missing depth": (lambda b: b.pop(DEPTH), r"lacks 'observation\.images\.front_depth'"),
@@ -161,7 +167,7 @@ SPOILT_OBSERVATIONS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "NaN in extrinsics": (put(keys.EXTRINSICS, torch.nan, 3), r"camera_extrinsics holds NaN"),
     "NaN in colours": (put(FRONT, torch.nan, 3, 5), r"observation\.images\.front holds NaN"),
     "depth in metres": (scale(DEPTH, 1e-3), r"front_depth.*looks like metres.*millimetres"),
-    "no valid depth": (scale(DEPTH, 0.0), r"front_depth.*without any valid depth"),
+    "no valid depth": (blind, r"no camera of \['front', 'wrist'\] has any valid depth"),
     "quaternion of norm 4": (
         put(keys.STATE, 2.0, slice(3, 7)),
         r"observation\.state.*quaternion of norm 4.*w, x, y, z",
@@ -206,6 +212,22 @@ def test_targets_that_would_spoil_the_weights_are_refused(
     before, _ = make_pre_post_processors(tiny_config())
     with pytest.raises(ValueError, match=message):
         before(batch)
+
+
+def test_a_dead_camera_is_left_out_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
+    rows = episode(3)
+    before, after = make_pre_post_processors(tiny_config())
+    policy = tiny_policy(tiny_config()).eval()
+    dead = observation(rows, 0)
+    scale(DEPTH, 0.0)(dead)
+    scale(FRONT, 0.0)(dead)
+    for _ in range(2):
+        action = after(policy.select_action(before(stack([dead]))))
+    assert action.isfinite().all()
+    assert policy.last_decision.view.tolist() == [policy.config.cameras.index("wrist")]
+    assert [record.message for record in caplog.records if "without any depth" in record.message] == [
+        "front has images without any depth (all 0): decisions leave them out"
+    ]
 
 
 def test_good_input_passes_unchanged_but_for_the_type_of_depth() -> None:

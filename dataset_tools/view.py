@@ -1,0 +1,104 @@
+"""``histmv view``: watch the scripted expert of a task, in a window or as a video."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from dataset_tools.eval_settings import REPORTED_SEEDS
+from dataset_tools.record import RecordEnvConfig
+from dataset_tools.video import VideoWriter
+from lerobot_histmv.envs import UR5Env, make
+from lerobot_histmv.envs.motion import TICK
+
+END_FRAMES = 20
+"""The last picture of a video stays for a second."""
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@dataclass
+class ViewConfig:
+    """Watch the expert of a task: histmv view --env.task=turn_tap."""
+
+    # the task and its options, as for `histmv record`
+    env: RecordEnvConfig = field(default_factory=lambda: RecordEnvConfig(image_size=256))
+    # scene
+    seed: int = REPORTED_SEEDS
+    # scenes to show, one after the other
+    episodes: int = 1
+    # open an interactive window; without one, a video is written
+    window: bool = field(default_factory=has_display)
+    # the video, cameras side by side; by default outputs/view/<task>_<seed>.mp4
+    output: Path | None = None
+
+
+def run(config: ViewConfig) -> None:
+    """Show or film the expert.
+
+    Raises:
+        ValueError: an option is not accepted.
+    """
+    if config.episodes < 1:
+        raise ValueError(f"episodes is {config.episodes}; it must be at least 1")
+    options = config.env
+    env = make(
+        options.task,
+        cameras=tuple(options.cameras),
+        image_size=options.image_size,
+        render_size=options.image_size,
+        variation=options.variation,
+        disturbances=options.disturbances,
+    )
+    path = config.output or Path("outputs/view") / f"{options.task}_{config.seed}.mp4"
+    console = Console(highlight=False)
+    with window(env) if config.window else film(env, path) as show:
+        for seed in range(config.seed, config.seed + config.episodes):
+            _, info = env.reset(seed=seed)
+            with env.stage.watching(show):
+                for motion in env.expert():
+                    env.execute(motion)
+            outcome = "success" if env.is_success() else env.failure()
+            console.print(f"{options.task}, scene {seed}: {info['instruction']}: {outcome}", soft_wrap=True)
+    env.close()
+    if not config.window:
+        console.print(f"video: {path}", soft_wrap=True)
+
+
+@contextmanager
+def film(env: UR5Env, path: Path) -> Iterator[Callable[[], None]]:
+    """A function that adds what the cameras see to the video."""
+    with VideoWriter(path, fps=round(1 / TICK)) as video:
+
+        def show() -> None:
+            video.add(np.hstack(list(env.observe()["pixels"].values())))
+
+        yield show
+        for _ in range(END_FRAMES):
+            show()
+
+
+@contextmanager
+def window(env: UR5Env) -> Iterator[Callable[[], None]]:
+    """A function that shows the scene in MuJoCo's viewer in real time; closing the viewer ends the program."""
+    import mujoco.viewer
+
+    env.reset(seed=0)
+    simulation = env.stage.simulation
+    with mujoco.viewer.launch_passive(simulation.model, simulation.data) as viewer:
+
+        def show() -> None:
+            if not viewer.is_running():
+                raise KeyboardInterrupt
+            viewer.sync()
+            time.sleep(TICK)
+
+        yield show

@@ -1,0 +1,32 @@
+"""``histmv view`` without a display: a video of the expert from every camera."""
+
+from pathlib import Path
+
+import av
+import draccus
+import pytest
+
+pytest.importorskip("mujoco")
+
+from dataset_tools.view import END_FRAMES, ViewConfig, run
+
+
+def test_the_expert_is_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "film.mp4"
+    flags = ["--env.task=reach_target", "--env.image_size=32", "--window=false", f"--output={path}", "--seed=5"]
+    run(draccus.parse(ViewConfig, args=flags))
+    with av.open(str(path)) as video:
+        frames = list(video.decode(video=0))
+    assert len(frames) > END_FRAMES + 20
+    assert (frames[0].width, frames[0].height) == (3 * 32, 32)
+    out = capsys.readouterr().out
+    assert "scene 5" in out
+    assert "success" in out
+    assert str(path) in out.replace("\n", "")
+
+
+def test_bad_options_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="episodes is 0"):
+        run(draccus.parse(ViewConfig, args=["--env.task=turn_tap", "--episodes=0"]))
+    with pytest.raises(ValueError, match="accepted are reach_target"):
+        run(draccus.parse(ViewConfig, args=["--env.task=juggle"]))
