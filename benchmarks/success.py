@@ -23,23 +23,27 @@ from dataset_tools.shards import write_json
 from dataset_tools.stages import Stage, read_state, run_stages
 
 RESULTS = Path(__file__).parent / "results" / "success.json"
-SETTINGS: dict[str, tuple[str, int, int | None]] = {
-    "reach_target": ("reach_target", 50, None),
-    "pick_and_lift": ("pick_and_lift", 50, None),
-    "push_buttons_fixed": ("push_buttons", 50, 6),
-    "push_buttons": ("push_buttons", 100, None),
+SETTINGS: dict[str, tuple[str, int]] = {
+    "reach_target": ("reach_target", 50),
+    "pick_and_lift": ("pick_and_lift", 50),
+    "push_buttons_fixed": ("push_buttons.red-green", 50),
+    "push_buttons": ("push_buttons", 100),
+    "turn_tap": ("turn_tap.left", 50),
+    "take_lid_off_saucepan": ("take_lid_off_saucepan", 50),
+    "put_item_in_drawer": ("put_item_in_drawer.middle", 50),
+    "stack_blocks": ("stack_blocks.two-red", 50),
+    "insert_onto_square_peg": ("insert_onto_square_peg.red", 50),
 }
-"""Task, demonstrations, and the variation if it is fixed: red, then green."""
+"""Task, demonstrations. One fixed variation is the paper's single-task protocol (section 4.1)."""
 SCENES = 100
 OUTPUT = Path("outputs/success")
 
 
 def data_stages(setting: str, folder: Path) -> list[Stage]:
     """Record and keyframe; the seeds share what they make."""
-    task, episodes, variation = SETTINGS[setting]
-    fixed = () if variation is None else (f"--env.variation={variation}",)
+    task, episodes = SETTINGS[setting]
     record = (
-        "histmv", "record", f"--env.task={task}", *fixed, f"--episodes={episodes}", "--seed=0",
+        "histmv", "record", f"--env.task={task}", f"--episodes={episodes}", "--seed=0",
         f"--repo_id=local/{setting}", f"--root={folder / 'episodes'}",
     )  # fmt: skip
     keyframe = (
@@ -51,8 +55,7 @@ def data_stages(setting: str, folder: Path) -> list[Stage]:
 
 def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
     """Train with one seed, then evaluate the final checkpoint."""
-    task, _, variation = SETTINGS[setting]
-    fixed = () if variation is None else (f"--env.variation={variation}",)
+    task, _ = SETTINGS[setting]
     training = folder / f"seed_{seed}" / "train"
     train = (
         "lerobot-train", f"--config_path={config_files.find('train/default')}", "--policy.device=cpu",
@@ -60,7 +63,7 @@ def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
         f"--output_dir={training}", f"--seed={seed}",
     )  # fmt: skip
     evaluate = (
-        "histmv", "eval", f"--policy.path={last_checkpoint(training)}", "--env.type=ur5", f"--env.task={task}", *fixed,
+        "histmv", "eval", f"--policy.path={last_checkpoint(training)}", "--env.type=ur5", f"--env.task={task}",
         f"--eval.n_episodes={SCENES}", f"--seed={REPORTED_SEEDS}", "--videos=0",
         f"--output_dir={folder / f'seed_{seed}' / 'evaluation'}",
     )  # fmt: skip
