@@ -26,17 +26,17 @@ class Disturbances:
         gripper_delay: the gripper takes its command 0.25 s late.
     """
 
-    # lights' brightness (40 %) and direction (15 degrees), per episode
+    # lights' brightness (by up to 0.4 of it) and direction (15 degrees), per episode
     lighting: float = 0.0
     # error of the extrinsics that are told: 5 mm, 0.5 degrees
     camera_pose: float = 0.0
-    # error of the focal length that is told: 1 %
+    # error of the focal length that is told: a hundredth
     camera_intrinsics: float = 0.0
     # Gaussian noise on colours: 6 of 255
     rgb_noise: float = 0.0
     # depth like a RealSense D435's: noise, holes at edges, dropouts
     depth: float = 0.0
-    # a card before one fixed camera that hides 30 % of its width
+    # a card before one fixed camera that hides 0.3 of its width
     occluder: float = 0.0
     # probability that one camera is dead
     dead_camera: float = 0.0

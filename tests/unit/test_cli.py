@@ -38,6 +38,14 @@ def test_options_may_be_spelt_with_dashes(word: str) -> None:
     assert cli.underscored("a-b") == "a-b"
 
 
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS.keys() - {"eval"}))
+def test_every_commands_help_can_be_shown(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """argparse formats an option's comment: a percent sign in it would raise."""
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([name, "--help"])
+    assert "--" in capsys.readouterr().out
+
+
 def test_help_lists_every_command_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["--help"])
     out = capsys.readouterr().out
