@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
 
 import mujoco
 import numpy as np
