@@ -13,8 +13,6 @@ from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import WORKSPACE
 from lerobot_histmv.envs.tasks.colors import COLORS, HELD_OUT_COLORS
 
-STREAM = 1
-"""Disturbances draw from this stream beside the scene's, so that they leave the scene as it is."""
 BRIGHTNESS, LIGHT_ANGLE = 0.4, np.radians(15)
 CAMERA_SHIFT, CAMERA_TURN, FOCAL_ERROR = 0.005, np.radians(0.5), 0.01
 ACTION_NOISE = 0.004
@@ -44,14 +42,14 @@ class Disturber:
         model = simulation.model
         self._diffuse, self._directions = model.light_diffuse.copy(), model.light_dir.copy()
 
-    def reset(self, seed: int, cameras: tuple[str, ...]) -> None:
+    def reset(self, rng: np.random.Generator, cameras: tuple[str, ...]) -> None:
         """Draw a new episode's disturbances; the scene is placed already.
 
         Args:
-            seed: the episode's.
+            rng: the episode's, of the disturbances' own, so that they leave the scene as it is.
             cameras: those that the environment renders.
         """
-        self._rng = rng = np.random.default_rng([seed, STREAM])
+        self._rng = rng
         self._light(rng)
         self._turns = {camera: Rotation.from_rotvec(rng.normal(0, CAMERA_TURN, 3)) for camera in cameras}
         self._shifts = {camera: rng.normal(0, CAMERA_SHIFT, 3) for camera in cameras}

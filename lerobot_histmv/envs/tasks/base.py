@@ -70,17 +70,33 @@ class Task(ABC):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Put the objects somewhere and reset the episode's own state."""
 
-    @abstractmethod
+    def stand(self, simulation: "Simulation", name: str, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Put an object that stands fast somewhere in its region; x, y [m] and yaw [rad] of the place."""
+        x, y, yaw = self.regions[name].draw(rng)
+        simulation.place_fixed(name, (x, y, 0), yaw)
+        return x, y, yaw
+
+    @property
+    def wanted(self) -> Collection[str]:
+        """Objects or parts ("cabinet/handle0") to be grasped."""
+        return ()
+
+    @property
+    def unwanted(self) -> Collection[str]:
+        """Those that the gripper might grasp by mistake."""
+        return ()
+
     def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Called after each tick with the gripper command in force."""
+        """Called after each tick with the gripper command in force; notes what is grasped."""
+        self.grasps.watch(simulation, gripper, [*self.wanted, *self.unwanted])
 
     @abstractmethod
     def is_success(self, simulation: "Simulation") -> bool:
         """Whether the task is fulfilled now."""
 
-    @abstractmethod
     def failure(self) -> str:
         """Why an episode that has run out of time failed: wrong object, grasp missed, not reached or time."""
+        return self.grasps.failure(self.wanted)
 
     def details(self) -> dict[str, Any]:
         """What the environment's ``info`` says beyond success and failure."""

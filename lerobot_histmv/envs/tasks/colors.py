@@ -38,6 +38,16 @@ class ColorTask(Task):
         """Colours that the variation names, in order."""
         return [word for word in self.goal if word in self.palette]
 
+    @property
+    def wanted(self) -> list[str]:
+        """The targets."""
+        return self.targets
+
+    @property
+    def unwanted(self) -> list[str]:
+        """The distractors."""
+        return self.distractors
+
     def candidates(self) -> list[str]:
         """Objects of the episode."""
         return list(self.objects)

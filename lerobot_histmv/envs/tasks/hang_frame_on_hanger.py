@@ -43,6 +43,7 @@ class HangFrameOnHanger(Task):
 
     name = "hang_frame_on_hanger"
     objects: ClassVar[Mapping[str, str]] = {"hook": "wall_hook", "stand": "frame_stand", "frame": "frame"}
+    wanted = ("frame",)
     regions: Mapping[str, Region] = MappingProxyType(
         {"hook": Region((0.48, 0.56), (-0.1, 0.1), YAWS), "stand": Region((0.3, 0.36), (-0.2, 0.2), YAWS)}
     )
@@ -61,25 +62,15 @@ class HangFrameOnHanger(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The board at the back, the frame in its stand in front."""
-        x, y, yaw = self.regions["hook"].draw(rng)
-        simulation.place_fixed("hook", (x, y, 0), yaw)
-        x, y, yaw = self.regions["stand"].draw(rng)
-        simulation.place_fixed("stand", (x, y, 0), yaw)
+        self.stand(simulation, "hook", rng)
+        x, y, yaw = self.stand(simulation, "stand", rng)
         simulation.place_free("frame", (x, y, STANDING), yaw)
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the frame was grasped."""
-        self.grasps.watch(simulation, gripper, ["frame"])
 
     def is_success(self, simulation: "Simulation") -> bool:
         """At the hook, let go."""
         place = simulation.site("hook/seat").position + np.array([0, 0, HANGING])
         offset = simulation.rotation("hook").T @ (simulation.position("frame") - place)
         return bool((np.abs(offset) < TOLERANCE).all()) and not simulation.gripped("frame")
-
-    def failure(self) -> str:
-        """Whether the frame was grasped."""
-        return self.grasps.failure(["frame"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """By the tab, around the stand's walls, over the hook's tip, down."""

@@ -42,6 +42,7 @@ class InsertOntoSquarePeg(Task):
 
     name = "insert_onto_square_peg"
     objects: ClassVar[Mapping[str, str]] = {"pegs": "pegs", "ring": "square_ring"}
+    wanted = ("ring",)
     regions: Mapping[str, Region] = MappingProxyType(
         {
             "pegs": Region((0.46, 0.56), (-0.1, 0.1), (-np.pi / 8, np.pi / 8)),
@@ -68,8 +69,7 @@ class InsertOntoSquarePeg(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Board at the back, ring in front of it."""
-        x, y, yaw = self.regions["pegs"].draw(rng)
-        simulation.place_fixed("pegs", (x, y, 0), yaw)
+        self.stand(simulation, "pegs", rng)
         x, y, yaw = self.regions["ring"].draw(rng)
         simulation.place_free("ring", (x, y, 0.0101), yaw)
         pegs = [PEGS[i] for i in rng.permutation(len(PEGS))]
@@ -79,18 +79,10 @@ class InsertOntoSquarePeg(Task):
         for peg, color in zip(pegs, (*self.goal, *(others[i] for i in drawn)), strict=True):
             simulation.paint(f"pegs/{peg}", COLORS[color])
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the ring was grasped."""
-        self.grasps.watch(simulation, gripper, ["ring"])
-
     def is_success(self, simulation: "Simulation") -> bool:
         """Around the named peg, low, released."""
         x, y, z = simulation.position("ring") - simulation.position(f"pegs/{self._peg}")
         return bool(np.hypot(x, y) < OFF_AXIS and z < HEIGHT) and not simulation.gripped("ring")
-
-    def failure(self) -> str:
-        """Whether the ring was grasped."""
-        return self.grasps.failure(["ring"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """By the tab, over the peg, down; the ring is turned as the peg is."""

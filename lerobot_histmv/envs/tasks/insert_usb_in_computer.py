@@ -43,6 +43,7 @@ class InsertUsbInComputer(Task):
 
     name = "insert_usb_in_computer"
     objects: ClassVar[Mapping[str, str]] = {"computer": "computer", "pedestal": "pedestal", "stick": "usb_stick"}
+    wanted = ("stick",)
     regions: Mapping[str, Region] = MappingProxyType(
         {"computer": Region((0.46, 0.54), (-0.12, 0.12), YAWS), "stick": Region((0.29, 0.36), (-0.22, 0.22), YAWS)}
     )
@@ -61,25 +62,16 @@ class InsertUsbInComputer(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The computer at the back, the stick in front of it, its plug away from the robot."""
-        x, y, yaw = self.regions["computer"].draw(rng)
-        simulation.place_fixed("computer", (x, y, 0), yaw)
+        self.stand(simulation, "computer", rng)
         x, y, yaw = self.regions["stick"].draw(rng)
         simulation.place_fixed("pedestal", (x, y, 0), yaw)
         simulation.place_free("stick", (x, y, LYING), yaw)
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the stick was grasped."""
-        self.grasps.watch(simulation, gripper, ["stick"])
 
     def is_success(self, simulation: "Simulation") -> bool:
         """The tip in the port."""
         offset = simulation.site("stick/tip").position - simulation.site("computer/port").position
         depth, *aside = simulation.rotation("computer").T @ offset
         return bool(depth > INSERTED and np.linalg.norm(aside) < OFF_AXIS)
-
-    def failure(self) -> str:
-        """Whether the stick was grasped."""
-        return self.grasps.failure(["stick"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """By its body, in front of the port, straight in."""

@@ -43,6 +43,7 @@ class MoveHanger(Task):
 
     name = "move_hanger"
     objects: ClassVar[Mapping[str, str]] = dict.fromkeys(RACKS, "rack") | {"hanger": "coat_hanger"}
+    wanted = ("hanger",)
     regions: Mapping[str, Region] = MappingProxyType(
         {
             "left_rack": Region((0.35, 0.49), (0.13, 0.21), YAWS),
@@ -69,26 +70,17 @@ class MoveHanger(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Racks left and right, the hanger on either."""
         for rack in RACKS:
-            x, y, yaw = self.regions[rack].draw(rng)
-            simulation.place_fixed(rack, (x, y, 0), yaw)
+            self.stand(simulation, rack, rng)
         self._start, self._goal = (RACKS[i] for i in rng.permutation(2))
         simulation.refresh()
         seat = simulation.site(f"{self._start}/seat").position
         simulation.place_free("hanger", seat + np.array([0, 0, HANGS]), simulation.yaw(self._start))
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the hanger was grasped."""
-        self.grasps.watch(simulation, gripper, ["hanger"])
 
     def is_success(self, simulation: "Simulation") -> bool:
         """On the other rod, let go."""
         seat = simulation.site(f"{self._goal}/seat").position
         offset = simulation.rotation(self._goal).T @ (simulation.position("hanger") - seat)
         return bool((np.abs(offset) < TOLERANCE).all()) and not simulation.gripped("hanger")
-
-    def failure(self) -> str:
-        """Whether the hanger was grasped."""
-        return self.grasps.failure(["hanger"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Free the hook by lifting and moving it away from the robot; at the other rack the same way back."""

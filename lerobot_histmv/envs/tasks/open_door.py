@@ -64,8 +64,7 @@ class OpenDoor(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Upright, the lever more or less towards the robot; latched."""
-        x, y, yaw = self.regions["door"].draw(rng)
-        simulation.place_fixed("door", (x, y, 0), yaw)
+        self.stand(simulation, "door", rng)
         self._unlocked = False
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:

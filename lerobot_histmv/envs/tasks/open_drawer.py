@@ -35,9 +35,18 @@ class Drawers(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The cabinet at the right, its front more or less towards the left."""
-        x, y, yaw = self.regions["cabinet"].draw(rng)
-        simulation.place_fixed("cabinet", (x, y, 0), yaw)
+        self.stand(simulation, "cabinet", rng)
         self.number = DRAWERS.index(self.goal[0])
+
+    @property
+    def wanted(self) -> list[str]:
+        """The named handle."""
+        return [f"cabinet/handle{self.number}"]
+
+    @property
+    def unwanted(self) -> list[str]:
+        """The other handles."""
+        return [f"cabinet/handle{i}" for i in range(len(DRAWERS)) if i != self.number]
 
     def opened(self, simulation: "Simulation") -> float:
         """How far the named drawer is out [m]."""
@@ -79,17 +88,9 @@ class OpenDrawer(Drawers):
         "held_out": ("the {} drawer should be open", "draw the {} drawer towards you", "get the {} drawer open"),
     }
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember which handle was grasped."""
-        self.grasps.watch(simulation, gripper, [f"cabinet/handle{i}" for i in range(len(DRAWERS))])
-
     def is_success(self, simulation: "Simulation") -> bool:
         """Far enough out."""
         return self.opened(simulation) > OPEN
-
-    def failure(self) -> str:
-        """Which handle was grasped, if any."""
-        return self.grasps.failure([f"cabinet/handle{self.number}"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Grasp and pull."""

@@ -37,6 +37,7 @@ class OpenMicrowave(Task):
 
     name = "open_microwave"
     objects: ClassVar[Mapping[str, str]] = {"microwave": "microwave"}
+    wanted = ("microwave/handle",)
     regions: Mapping[str, Region] = MappingProxyType(
         {"microwave": Region((0.5, 0.55), (-0.12, 0.12), (-np.pi / 8, np.pi / 8))}
     )
@@ -55,20 +56,11 @@ class OpenMicrowave(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """At the back, its front more or less towards the robot."""
-        x, y, yaw = self.regions["microwave"].draw(rng)
-        simulation.place_fixed("microwave", (x, y, 0), yaw)
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the bar was grasped."""
-        self.grasps.watch(simulation, gripper, ["microwave/handle"])
+        self.stand(simulation, "microwave", rng)
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Far enough open."""
         return simulation.joint("microwave/door") > OPEN
-
-    def failure(self) -> str:
-        """Whether the bar was grasped."""
-        return self.grasps.failure(["microwave/handle"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Take the bar's upper end from above, follow the arc."""

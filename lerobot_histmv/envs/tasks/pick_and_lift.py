@@ -20,8 +20,6 @@ SUCCESS_HEIGHT = 0.2
 """The region of success is the space above this height [m] of the cube's centre."""
 ABOVE = 0.14
 """Height [m] of the via points over the cube."""
-CARRY = (0.28, 0.0, 0.30)
-"""Where the expert brings the cube [m]: in front of the robot."""
 
 
 class PickAndLift(ColorTask):
@@ -41,6 +39,8 @@ class PickAndLift(ColorTask):
     name = "pick_and_lift"
     objects: ClassVar[Mapping[str, str]] = {"cube0": "cube", "cube1": "cube", "cube2": "cube"}
     variations = tuple((color,) for color in COLORS)
+    carry: ClassVar[tuple[float, float, float]] = (0.28, 0.0, 0.30)
+    """Where the expert brings what it holds [m]: in front of the robot."""
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
             "pick up the {} cube and lift it",
@@ -62,30 +62,27 @@ class PickAndLift(ColorTask):
         for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
             simulation.place_free(name, (x, y, CUBE_HEIGHT), rng.uniform(-np.pi, np.pi))
 
+    def grasp(self, simulation: "Simulation") -> Pose:
+        """Pose that takes the target."""
+        (target,) = self.targets
+        return top_down(simulation.position(target), nearest_turn(simulation.yaw(target), self.symmetry()))
+
     def symmetry(self) -> float:
         """Least turn [rad] that leaves a block as it is."""
         return np.pi / 2
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember what has been grasped."""
-        self.grasps.watch(simulation, gripper, self.slots)
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Grasped and lifted."""
         target = self.targets[0]
         return bool(simulation.position(target)[2] > SUCCESS_HEIGHT) and simulation.gripped(target)
 
-    def failure(self) -> str:
-        """Wrong cube grasped; never closed; closed beside the cube; else held but not lifted in time."""
-        return self.grasps.failure(self.targets)
-
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Down over the cube, grasp, up and back towards the robot."""
-        cube = self.targets[0]
-        grasp = top_down(simulation.position(cube), nearest_turn(simulation.yaw(cube), self.symmetry()))
+        grasp = self.grasp(simulation)
         yield Motion(via=(grasp.raised(ABOVE),), target=grasp, gripper=0.0)
-        carry = Pose(np.array(CARRY), grasp.quaternion)
-        yield Motion(via=(grasp.raised(ABOVE),), target=carry, gripper=0.0, dwell=4)
+        yield Motion(
+            via=(grasp.raised(ABOVE),), target=Pose(np.array(self.carry), grasp.quaternion), gripper=0.0, dwell=4
+        )
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:

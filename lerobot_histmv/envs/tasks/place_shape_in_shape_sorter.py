@@ -69,24 +69,25 @@ class PlaceShapeInShapeSorter(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """The box at the back, the shapes in front of it."""
-        x, y, yaw = self.regions["sorter"].draw(rng)
-        simulation.place_fixed("sorter", (x, y, 0), yaw)
+        self.stand(simulation, "sorter", rng)
         places = scatter(rng, len(SYMMETRY), APART, self.regions["shapes"].area)
         for shape, (x, y) in zip(SYMMETRY, places, strict=True):
             simulation.place_free(shape, (x, y, 0.0121), rng.uniform(-np.pi, np.pi))
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember which shapes were grasped."""
-        self.grasps.watch(simulation, gripper, SYMMETRY)
+    @property
+    def wanted(self) -> list[str]:
+        """The named shape."""
+        return list(self.goal)
+
+    @property
+    def unwanted(self) -> list[str]:
+        """The others."""
+        return [shape for shape in SYMMETRY if shape not in self.goal]
 
     def is_success(self, simulation: "Simulation") -> bool:
         """In the box."""
         offset = simulation.rotation("sorter").T @ (simulation.position(self.goal[0]) - simulation.position("sorter"))
         return bool((np.abs(offset - np.array([0, 0, 0.033])) < INSIDE).all())
-
-    def failure(self) -> str:
-        """Which shape was held, if any."""
-        return self.grasps.failure(self.goal)
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """By its pin, turned to fit, down into the hole."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_histmv.envs.motion import Motion, top_down
 from lerobot_histmv.envs.tasks.base import nearest_turn
-from lerobot_histmv.envs.tasks.open_drawer import APPROACH, DRAWERS, Drawers
+from lerobot_histmv.envs.tasks.open_drawer import APPROACH, Drawers
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -63,9 +63,10 @@ class PutItemInDrawer(Drawers):
         offset = simulation.rotation("cabinet") @ np.array([*rng.uniform(*ITEM_AREA.T), TOP + 0.0205])
         simulation.place_free("item", simulation.position("cabinet") + offset, rng.uniform(-np.pi, np.pi))
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember what was grasped."""
-        self.grasps.watch(simulation, gripper, ["item", *(f"cabinet/handle{i}" for i in range(len(DRAWERS)))])
+    @property
+    def wanted(self) -> list[str]:
+        """The item and the named handle."""
+        return ["item", *super().wanted]
 
     def is_success(self, simulation: "Simulation") -> bool:
         """In the drawer, let go."""
@@ -73,10 +74,6 @@ class PutItemInDrawer(Drawers):
         offset = simulation.rotation(drawer).T @ (simulation.position("item") - simulation.position(drawer))
         within = np.abs(offset - np.array([0.09, 0, 0])) < INSIDE
         return bool(within.all()) and not simulation.gripped("item")
-
-    def failure(self) -> str:
-        """What was grasped, if anything."""
-        return self.grasps.failure(["item", f"cabinet/handle{self.number}"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Open the drawer, fetch the item, let it go over the drawer."""

@@ -63,7 +63,7 @@ class StackBlocks(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Everything anywhere, at least 9 cm apart."""
         names = [f"block{i}" for i in rng.permutation(6)]
-        self.targets, self.distractors = names[:4], names[4:]
+        self._named, self._others = names[:4], names[4:]
         plane, *places = scatter(rng, 7, APART)
         simulation.place_fixed("plane", (*plane, 0))
         for name, (x, y) in zip(names, places, strict=True):
@@ -71,32 +71,34 @@ class StackBlocks(Task):
         others = [color for color in COLORS if color != self.goal[1]]
         other = others[rng.integers(len(others))]
         for name in names:
-            simulation.paint(name, COLORS[self.goal[1] if name in self.targets else other])
+            simulation.paint(name, COLORS[self.goal[1] if name in self._named else other])
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember what has been grasped."""
-        self.grasps.watch(simulation, gripper, [*self.targets, *self.distractors])
+    @property
+    def wanted(self) -> list[str]:
+        """Blocks of the named colour."""
+        return self._named
+
+    @property
+    def unwanted(self) -> list[str]:
+        """Blocks of the other colour."""
+        return self._others
 
     def is_success(self, simulation: "Simulation") -> bool:
         """A named block at each of the lowest levels, and nothing held."""
         levels = self._levels(simulation)
-        return set(range(COUNTS[self.goal[0]])) <= levels and not any(map(simulation.gripped, self.targets))
+        return set(range(COUNTS[self.goal[0]])) <= levels and not any(map(simulation.gripped, self._named))
 
     def _levels(self, simulation: "Simulation") -> set[int]:
         """Levels of the tower over the square that named blocks fill."""
-        offsets = [simulation.position(name) - simulation.position("plane") for name in self.targets]
+        offsets = [simulation.position(name) - simulation.position("plane") for name in self._named]
         tower = [z / SIDE - 0.5 for x, y, z in offsets if np.hypot(x, y) < OFF_AXIS]
         return {round(level) for level in tower if abs(level - round(level)) * SIDE < LEVEL_TOLERANCE}
-
-    def failure(self) -> str:
-        """Which block was held, if any."""
-        return self.grasps.failure(self.targets)
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """The blocks nearest to the square, one after the other."""
         away: tuple[Pose, ...] = ()
         square = simulation.position("plane")
-        nearest = sorted(self.targets, key=lambda name: float(np.linalg.norm(simulation.position(name) - square)))
+        nearest = sorted(self._named, key=lambda name: float(np.linalg.norm(simulation.position(name) - square)))
         for level, name in enumerate(nearest[: COUNTS[self.goal[0]]]):
             grasp = top_down(simulation.position(name), nearest_turn(simulation.yaw(name), np.pi / 2))
             yield Motion(via=(*away, grasp.raised(ABOVE)), target=grasp, gripper=0.0)

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from lerobot_histmv.envs.motion import Motion
-from lerobot_histmv.envs.tasks.base import scatter
 from lerobot_histmv.envs.tasks.colors import COLORS, ColorTask
-from lerobot_histmv.envs.tasks.pick_up_cup import rim_grasp
+from lerobot_histmv.envs.tasks.pick_up_cup import rim_grasp, stand_cups
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -61,12 +60,17 @@ class StackCups(ColorTask):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Cups standing anywhere, at least 14 cm apart."""
-        for name, (x, y) in zip(self.slots, scatter(rng, len(self.slots), APART), strict=True):
-            simulation.place_free(name, (x, y, 0.0005), 0)
+        stand_cups(simulation, self.slots, APART, rng)
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember what has been grasped."""
-        self.grasps.watch(simulation, gripper, self.slots)
+    @property
+    def wanted(self) -> list[str]:
+        """The cups that move."""
+        return self.distractors
+
+    @property
+    def unwanted(self) -> list[str]:
+        """The cup that stays."""
+        return self.targets
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Both others stand over the named cup, one in the other, released."""
@@ -79,10 +83,6 @@ class StackCups(ColorTask):
             and bool(((steps > HEIGHTS[0]) & (steps < HEIGHTS[1])).all())
             and not any(simulation.gripped(name) for name in self.slots)
         )
-
-    def failure(self) -> str:
-        """Which cup was held, if any."""
-        return self.grasps.failure(self.distractors)
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """The nearer cup first; each over the pile, down into it, let go."""

@@ -37,6 +37,7 @@ class TakeLidOffSaucepan(Task):
 
     name = "take_lid_off_saucepan"
     objects: ClassVar[Mapping[str, str]] = {"saucepan": "saucepan", "lid": "lid"}
+    wanted = ("lid",)
     regions: Mapping[str, Region] = MappingProxyType(
         {"saucepan": Region((0.36, 0.52), (-0.2, 0.2), (-np.pi, np.pi)), "rest": Region((0.3, 0.3), (0.0, 0.0))}
     )
@@ -57,23 +58,14 @@ class TakeLidOffSaucepan(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Anywhere in the area; the handle points anywhere, and so does the lid's knob."""
-        x, y, yaw = self.regions["saucepan"].draw(rng)
-        simulation.place_fixed("saucepan", (x, y, 0), yaw)
+        x, y, _ = self.stand(simulation, "saucepan", rng)
         self._rest = self.regions["rest"].draw(rng)
         simulation.place_free("lid", (x, y, 0.068), rng.uniform(-np.pi, np.pi))
-
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember whether the lid was grasped."""
-        self.grasps.watch(simulation, gripper, ["lid"])
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Held high above the pan."""
         height = simulation.position("lid")[2] - simulation.site("saucepan/seat").position[2]
         return bool(height > SUCCESS_HEIGHT) and simulation.gripped("lid")
-
-    def failure(self) -> str:
-        """Whether the lid was grasped."""
-        return self.grasps.failure(["lid"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Grasp the knob across, straight up."""

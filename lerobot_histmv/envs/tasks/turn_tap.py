@@ -60,20 +60,21 @@ class TurnTap(Task):
 
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Anywhere in the area, with the spout more or less towards the robot."""
-        x, y, yaw = self.regions["tap"].draw(rng)
-        simulation.place_fixed("tap", (x, y, 0), yaw)
+        self.stand(simulation, "tap", rng)
 
-    def watch(self, simulation: "Simulation", gripper: float) -> None:
-        """Remember which knob was grasped."""
-        self.grasps.watch(simulation, gripper, [f"tap/{side}" for side in DIRECTIONS])
+    @property
+    def wanted(self) -> list[str]:
+        """The named knob."""
+        return [f"tap/{side}" for side in self.goal]
+
+    @property
+    def unwanted(self) -> list[str]:
+        """The other one."""
+        return [f"tap/{side}" for side in DIRECTIONS if side not in self.goal]
 
     def is_success(self, simulation: "Simulation") -> bool:
         """Turned far enough."""
         return simulation.joint(f"tap/{self.goal[0]}") > OPEN
-
-    def failure(self) -> str:
-        """Which knob was grasped, if any."""
-        return self.grasps.failure([f"tap/{self.goal[0]}"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Grasp the bar across and turn the wrist."""

@@ -50,6 +50,7 @@ class WaterPlants(Task):
         {"can": Region((0.32, 0.5), (-0.24, 0.24)), "plant": Region((0.38, 0.52), (-0.24, 0.24))}
     )
     clear_steps = 4
+    wanted = ("can",)
     variations = ((),)
     templates: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "train": (
@@ -78,7 +79,7 @@ class WaterPlants(Task):
 
     def watch(self, simulation: "Simulation", gripper: float) -> None:
         """Remember whether the can was held; pour when it is tilted."""
-        self.grasps.watch(simulation, gripper, ["can"])
+        super().watch(simulation, gripper)
         if self._poured < len(DROPS) and simulation.rotation("can")[2, 2] < POURS:
             simulation.place_free(DROPS[self._poured], simulation.site("can/spout").position, 0)
             self._poured += 1
@@ -87,10 +88,6 @@ class WaterPlants(Task):
         """All drops in the pot."""
         offsets = [simulation.position(drop) - simulation.position("plant") for drop in DROPS]
         return all(np.hypot(x, y) < POT_RADIUS and 0 < z < POT_HEIGHT for x, y, z in offsets)
-
-    def failure(self) -> str:
-        """Whether the can was held."""
-        return self.grasps.failure(["can"])
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
         """Take the can by its handle, bring the spout over the pot, tilt about the spout."""
