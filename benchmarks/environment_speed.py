@@ -2,7 +2,7 @@
 
     python benchmarks/environment_speed.py [--tasks turn_tap water_plants] [--episodes=3]
 
-Per task: macro steps with observation per second on one core, the share of rendering in it, and the same pictures from
+Per task: macro-step observations per second on one core, the share of rendering in it, and the same pictures from
 ``mujoco.Renderer`` with the stock meshes as the peer. For ``pick_and_lift``: demonstrations per minute as key poses in
 two processes, and how much two environments in processes of their own give over one. Results go to
 ``benchmarks/results/environment_speed.json``; they mean something on an idle machine only.
@@ -34,24 +34,24 @@ DEMONSTRATED = "pick_and_lift"
 
 
 def demonstrate(env: UR5Env, seed: int) -> int:
-    """One episode in macro steps; how many there were."""
+    """One episode in macro steps; how many observations there were, the first one included."""
     env.reset(seed=seed)
-    steps = 0
+    observations = 1
     for motion in env.expert():
         for action in motion.actions(env.stage.controller.gripper):
             *_, terminated, truncated, _ = env.step(action)
-            steps += 1
+            observations += 1
             if terminated or truncated:
-                return steps
-    return steps
+                return observations
+    return observations
 
 
 def speed(task: str, episodes: int) -> dict[str, float]:
-    """Macro steps per second of one process, and how long the pictures of one take."""
+    """Macro-step observations per second of one process, and how long the pictures of one take."""
     env = make(task, image_size=SIZE)
     env.reset(seed=SEED)
     begin = time.perf_counter()
-    steps = sum(demonstrate(env, SEED + episode) for episode in range(episodes))
+    observations = sum(demonstrate(env, SEED + episode) for episode in range(episodes))
     seconds = time.perf_counter() - begin
     begin = time.perf_counter()
     for _ in range(20):
@@ -59,9 +59,9 @@ def speed(task: str, episodes: int) -> dict[str, float]:
     observing = (time.perf_counter() - begin) / 20
     env.close()
     return {
-        "observations_per_second": round(steps / seconds, 1),
+        "observations_per_second": round(observations / seconds, 1),
         "observe_ms": round(1000 * observing, 1),
-        "share_of_rendering": round(observing * (steps + episodes) / seconds, 2),
+        "share_of_rendering": round(observing * observations / seconds, 2),
     }
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from lerobot_histmv.envs.motion import Pose
 from lerobot_histmv.envs.scene import arm_spec
-from lerobot_histmv.geometry import quaternion_from_matrix
+from lerobot_histmv.geometry import canonical
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 POSITION_TOLERANCE = 1e-4
@@ -14,6 +14,13 @@ ROTATION_TOLERANCE = 1e-3
 MAX_ITERATIONS = 60
 DAMPING = 1e-3
 MAX_JOINT_STEP = 0.5
+
+
+def pose_at(position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, " 9"]) -> Pose:
+    """Pose from what MuJoCo keeps of a body or site; for single ones MuJoCo converts ten times faster than scipy."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation)
+    return Pose(position.copy(), canonical(quaternion))
 
 
 class ArmKinematics:
@@ -39,8 +46,7 @@ class ArmKinematics:
         """Tool pose in the base frame for joint angles [rad]."""
         self._data.qpos[:] = joints
         mujoco.mj_kinematics(self._model, self._data)
-        rotation = self._data.site_xmat[self._site].reshape(3, 3)
-        return Pose(self._data.site_xpos[self._site].copy(), quaternion_from_matrix(rotation))
+        return pose_at(self._data.site_xpos[self._site], self._data.site_xmat[self._site])
 
     def solve(self, target: Pose, seed: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " 6"] | None:
         """Joint angles [rad] near ``seed`` that bring the tool to ``target``, or None if none are found.

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lerobot_histmv.envs import scene
-from lerobot_histmv.envs.kinematics import JOINTS, ArmKinematics
+from lerobot_histmv.envs.kinematics import JOINTS, ArmKinematics, pose_at
 from lerobot_histmv.envs.motion import TICK, Point, Pose, top_down
 from lerobot_histmv.geometry import quaternion_from_matrix
 
@@ -21,6 +21,9 @@ REFERENCE_STEPS = 5
 """Physics steps between updates of the actuators' reference inside a tick."""
 GRIPPER_CLOSED_CONTROL = 255.0
 FREE = mujoco.mjtJoint.mjJNT_FREE
+SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+"""While ticking, what lies still is not simulated until something touches it: half of the physics' time. Not while a
+scene is set up: MuJoCo takes fixed bodies for asleep, and would leave them where they were."""
 DRIVER_CLOSED = 0.8
 """Angle [rad] of the finger drivers when closed."""
 
@@ -59,6 +62,7 @@ class Simulation:
 
     def reset(self) -> None:
         """Arm at home, gripper open, objects where the model has them, everything at rest."""
+        self.model.opt.enableflags = 0
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._qpos] = self.home
         self.data.ctrl[:6] = self.home
@@ -74,6 +78,7 @@ class Simulation:
         """Simulate one control period while the joint reference [rad] moves linearly from ``start`` to ``end``."""
         lead = FEED_FORWARD * (end - start) / TICK
         self.data.ctrl[6] = GRIPPER_CLOSED_CONTROL * (1 - gripper)
+        self.model.opt.enableflags = SLEEP
         for step in range(0, self._steps, REFERENCE_STEPS):
             share = (step + REFERENCE_STEPS) / self._steps
             self.data.ctrl[:6] = start + share * (end - start) + lead
@@ -88,8 +93,7 @@ class Simulation:
 
     def tool_pose(self) -> Pose:
         """Measured pose of the tool."""
-        rotation = self.data.site_xmat[self._tool].reshape(3, 3)
-        return Pose(self.data.site_xpos[self._tool].copy(), quaternion_from_matrix(rotation))
+        return pose_at(self.data.site_xpos[self._tool], self.data.site_xmat[self._tool])
 
     def gripper_opening(self) -> float:
         """Measured opening: 1 open, 0 closed."""
@@ -111,7 +115,7 @@ class Simulation:
     def site(self, name: str) -> Pose:
         """Pose of an object's site; a site that marks a grasp has the tool's axes."""
         site = self.data.site(_full(name, "grasp"))
-        return Pose(site.xpos.copy(), quaternion_from_matrix(site.xmat.reshape(3, 3)))
+        return pose_at(site.xpos, site.xmat)
 
     def joint(self, name: str) -> float:
         """Position [m or rad] of an object's joint with one degree of freedom."""
@@ -144,8 +148,18 @@ class Simulation:
 
     def is_alone(self, name: str) -> bool:
         """Whether an object, where it was just placed or rests, touches nothing but the table."""
-        mujoco.mj_fwdPosition(self.model, self.data)
+        self._find_contacts()
         return self._touching(self._geoms(name)) <= {self.model.geom("table").id}
+
+    def overlap(self) -> float:
+        """How deep [m] something lies inside something else, at worst."""
+        self._find_contacts()
+        return float(-self.data.contact.dist.min(initial=0))
+
+    def _find_contacts(self) -> None:
+        """Of everything where it is now; the contacts of the last tick leave out what slept."""
+        self.model.opt.enableflags = 0
+        mujoco.mj_fwdPosition(self.model, self.data)
 
     def loose(self, names: Iterable[str]) -> list[str]:
         """Those of the objects that lie about: they have a free joint."""
