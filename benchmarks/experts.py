@@ -75,7 +75,7 @@ CONTROLS = {
 
 
 def bad_start(env: UR5Env) -> bool:
-    """Whether the scene is solved already, has objects or robot inside one another, or starts with an impossible motion."""
+    """Whether the scene is solved already, something overlaps, or the first motion is out of reach."""
     motion = next(env.expert())
     reachable = env.stage.controller.plan(motion.via, motion.target, motion.speed) is not None
     return env.is_success() or not reachable or env.stage.simulation.overlap() > OVERLAP
