@@ -21,8 +21,10 @@ class Disturbances:
         occluder: a grey card hangs before one fixed camera and hides 30 % of the width of its picture.
         dead_camera: probability that one camera of the episode gives black pictures without depth.
         distractors: number of blocks that the task does not know, on free places of the table.
-        moved_object: probability that, once in an episode, one of the task's loose objects is moved by up to 6 cm.
-        action_noise: Gaussian noise of 4 mm on each axis of every commanded position.
+        moved_object: probability that, once in an episode and between two motions, one of the task's loose objects is
+            moved by 3 to 6 cm.
+        action_noise: Gaussian noise of 4 mm on each axis of every commanded position; in recordings, one error for all
+            key poses of a motion, and what is recorded is where the arm went.
         gripper_delay: the gripper takes its command 0.25 s late.
     """
 

@@ -1,5 +1,6 @@
 """Applies ``Disturbances`` to a simulation, episode by episode."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -7,7 +8,7 @@ from jaxtyping import Float, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
 from lerobot_histmv.envs.disturbances import Disturbances
-from lerobot_histmv.envs.motion import TICK, Pose
+from lerobot_histmv.envs.motion import TICK, Motion
 from lerobot_histmv.envs.sensor_noise import CARD_WIDTH, hide_behind_card, noisy_colors, stereo_depth
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import WORKSPACE
@@ -20,8 +21,8 @@ GRIPPER_DELAY = round(0.25 / TICK)
 """Ticks."""
 MOVE = (0.03, 0.06)
 """How far an object is moved [m]."""
-MOVE_WITHIN = 8
-"""An object is moved during one of an episode's first macro steps."""
+MOVE_WITHIN = 60
+"""An object is moved when the first motion after one of an episode's first ticks has ended."""
 ATTEMPTS = 200
 """Places tried until an object overlaps nothing."""
 BLOCK_HEIGHT = 0.0202
@@ -60,8 +61,7 @@ class Disturber:
         dead = cameras[rng.integers(len(cameras))]
         self._dead = dead if rng.random() < self.strengths.dead_camera else None
         moves = rng.random() < self.strengths.moved_object and bool(self._loose)
-        self._move_at = int(rng.integers(1, MOVE_WITHIN)) if moves else 0
-        self._steps = 0
+        self._move_at = rng.integers(MOVE_WITHIN) if moves else np.inf
         self._scatter(rng)
 
     def _light(self, rng: np.random.Generator) -> None:
@@ -89,10 +89,9 @@ class Disturber:
                 return True
         return False
 
-    def begin_step(self) -> None:
-        """Called before each macro step: the moment at which an object may be moved."""
-        self._steps += 1
-        if self._steps != self._move_at:
+    def after_motion(self, ticks: int) -> None:
+        """Called ``ticks`` into the episode, when a motion or a servo tick has ended: an object may be moved now."""
+        if ticks < self._move_at:
             return
         rng = self._rng
         for index in rng.permutation(len(self._loose)):
@@ -102,13 +101,16 @@ class Disturber:
                 angles, lengths = rng.uniform(-np.pi, np.pi, ATTEMPTS), rng.uniform(*MOVE, ATTEMPTS)
                 ways = np.column_stack([lengths * np.cos(angles), lengths * np.sin(angles), np.zeros(ATTEMPTS)])
                 within = [place + way for way in ways if _in_workspace(place + way)]
-                if not self._put(name, within, yaw):
-                    self._simulation.place_free(name, place, yaw)
-                return
+                if self._put(name, within, yaw):
+                    self._move_at = np.inf
+                    return
+                self._simulation.place_free(name, place, yaw)
 
-    def act(self, pose: Pose) -> Pose:
-        """The pose that the arm goes to when it is sent to ``pose``."""
-        return pose.moved(self.strengths.action_noise * self._rng.normal(0, ACTION_NOISE, 3))
+    def act(self, motion: Motion) -> Motion:
+        """What the arm does when it is told ``motion``."""
+        error = self.strengths.action_noise * self._rng.normal(0, ACTION_NOISE, 3)
+        via = tuple(pose.moved(error) for pose in motion.via)
+        return dataclasses.replace(motion, via=via, target=motion.target.moved(error))
 
     @property
     def gripper_delay(self) -> int:

@@ -11,7 +11,7 @@ from lerobot_histmv.envs.camera import Renderer, samples_for
 from lerobot_histmv.envs.controller import Controller
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.disturber import Disturber
-from lerobot_histmv.envs.motion import Motion, Pose
+from lerobot_histmv.envs.motion import Motion
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import Task
 
@@ -75,14 +75,18 @@ class Stage:
         finally:
             self.simulation.after_tick.remove(callback)
 
-    def go(self, pose: Pose, gripper: float, servo: bool) -> bool:
-        """One step of the environment: a whole macro step, or one tick towards ``pose``. False if out of reach."""
-        if self.disturber is not None:
-            self.disturber.begin_step()
-            pose = self.disturber.act(pose)
-        if servo:
-            return self.controller.servo(pose, gripper)
-        return self.controller.execute(Motion(via=(), target=pose, gripper=gripper))
+    def go(self, motion: Motion, servo: bool = False) -> bool:
+        """Run a whole motion, or one tick towards its target. False (the arm stays) if that is out of reach."""
+        act = self._servo if servo else self.controller.execute
+        if self.disturber is None:
+            return act(motion)
+        reached = act(self.disturber.act(motion))
+        self.disturber.after_motion(self.controller.ticks)
+        self.simulation.refresh()
+        return reached
+
+    def _servo(self, motion: Motion) -> bool:
+        return self.controller.servo(motion.target, motion.gripper)
 
     def look(self, camera: str, size: int) -> View:
         """A camera's picture and calibration."""

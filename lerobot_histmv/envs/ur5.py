@@ -180,7 +180,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         stage = self.stage
         self._frames = []
         with stage.watching(self._capture):
-            reached = stage.go(pose, gripper, servo=self.control == "servo")
+            reached = stage.go(Motion(via=(), target=pose, gripper=gripper), servo=self.control == "servo")
         self._out_of_reach |= not reached
         self._steps += 1
         success = self.is_success()
@@ -233,7 +233,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         controller = self.stage.controller
         controller.on_tick = on_tick
         try:
-            if not controller.execute(motion):
+            if not self.stage.go(motion):
                 raise ValueError(f"{motion.target} is out of the arm's reach")
         finally:
             controller.on_tick = None

@@ -100,19 +100,36 @@ def test_distractors_lie_free_and_the_expert_still_succeeds() -> None:
             assert info["is_success"]
 
 
-def test_an_object_is_moved_once_in_an_episode() -> None:
-    with disturbed(moved_object=1) as env:
-        env.reset(seed=1)
-        before, moves = places(env), 0
-        for _ in range(7):
-            env.step(AWAY)
-            after = places(env)
-            gone = [name for name in before if before[name] != after[name]]
-            moves += len(gone)
-            for name in gone:
-                assert 0.02 < np.linalg.norm(np.subtract(before[name], after[name])) < 0.07
-            before = after
+def moved(before: dict[str, tuple[float, ...]], after: dict[str, tuple[float, ...]]) -> list[str]:
+    gone = [name for name in before if before[name] != after[name]]
+    assert all(0.02 < np.linalg.norm(np.subtract(before[name], after[name])) < 0.07 for name in gone)
+    return gone
+
+
+@pytest.mark.parametrize("control", ["macro", "servo"])
+def test_an_object_is_moved_once_in_an_episode(control: str) -> None:
+    env = tiny("pick_and_lift", control=control, disturbances=Disturbances(moved_object=1))
+    env.reset(seed=1)
+    before, moves = places(env), 0
+    while env.stage.controller.ticks < 80:
+        env.step(AWAY if env.stage.controller.ticks < 40 else AWAY * [1, -1, 1, 1, 1, 1, 1, 1])
+        moves += len(moved(before, after := places(env)))
+        before = after
+    env.close()
     assert moves == 1
+
+
+def test_the_expert_follows_a_moved_object_and_aims_with_the_noise() -> None:
+    with disturbed(moved_object=1, action_noise=0.5) as env:
+        succeeded, misses = [], []
+        for seed in range(7):
+            env.reset(seed=seed)
+            for motion in env.expert():
+                env.execute(motion)
+                misses.append(env.stage.simulation.tool_pose().position - motion.target.position)
+            succeeded.append(env.is_success())
+    assert sum(succeeded) >= 6
+    assert 0.001 < np.std(misses) < 0.004
 
 
 def test_action_noise_moves_the_target_by_millimetres() -> None:
