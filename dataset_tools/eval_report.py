@@ -12,7 +12,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from dataset_tools.eval_results import Episode, wilson_interval
 
@@ -50,7 +50,8 @@ def success_rate(episodes: Sequence[Episode]) -> str:
 
 def results_table(info: dict[str, Any]) -> Table:
     """The final table of an ``eval_info.json``: one line per task, and one for all if there are several."""
-    table = Table("task", "success", "rate", "95 % interval", "failures", "decision", box=SIMPLE_HEAD)
+    task = Column("task", no_wrap=True, min_width=max(len(entry["task"]) for entry in info["per_task"]))
+    table = Table(task, "success", "rate", "95 % interval", "failures", "decision", box=SIMPLE_HEAD)
     entries = [(entry["task"], entry) for entry in info["per_task"]]
     if len(entries) > 1:
         entries.append(("all", info["overall"]))

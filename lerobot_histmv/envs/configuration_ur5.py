@@ -96,14 +96,12 @@ class UR5EnvConfig(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """``{"ur5": {i: vector environment of the i-th task}}``; finished sub-environments stand still."""
+        """``{task: {0: its vector environment}}``: LeRobot's results then name the tasks and variations.
+
+        Finished sub-environments stand still.
+        """
         vectorize = _asynchronous if use_async_envs and n_envs > 1 else _synchronous
-        return {
-            self.type: {
-                index: vectorize([partial(make, task, **self.gym_kwargs)] * n_envs)
-                for index, task in enumerate(self.tasks)
-            }
-        }
+        return {task: {0: vectorize([partial(make, task, **self.gym_kwargs)] * n_envs)} for task in self.tasks}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Observations get their dataset names; actions stay as they are."""

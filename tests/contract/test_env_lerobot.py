@@ -53,7 +53,7 @@ def test_bad_options_are_refused(options: dict[str, object], message: str) -> No
 @pytest.mark.parametrize("asynchronous", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["sync", "async"])
 def test_vector_environments_speak_the_datasets_language(asynchronous: bool) -> None:
     config = UR5EnvConfig(task="reach_target", image_size=SIZE, render_size=SIZE, cameras=["front", "wrist"])
-    (vector,) = config.create_envs(2, use_async_envs=asynchronous)["ur5"].values()
+    (vector,) = config.create_envs(2, use_async_envs=asynchronous)["reach_target"].values()
     processor, _ = config.get_env_processors()
     try:
         observation, info = vector.reset(seed=[3, 5])
@@ -81,8 +81,15 @@ def test_scenes_do_not_depend_on_how_environments_are_run() -> None:
     config = UR5EnvConfig(task="pick_and_lift", image_size=SIZE, render_size=SIZE)
     images = []
     for count, seeds in ((2, [7, 8]), (1, [8])):
-        (vector,) = config.create_envs(count)["ur5"].values()
+        (vector,) = config.create_envs(count)["pick_and_lift"].values()
         observation, _ = vector.reset(seed=seeds)
         images.append(observation["pixels"]["front"][-1])
         vector.close()
     np.testing.assert_array_equal(*images)
+
+
+def test_a_suite_names_its_tasks_and_variations() -> None:
+    envs = UR5EnvConfig(task="set1", image_size=SIZE, render_size=SIZE).create_envs(1)
+    assert list(envs)[:3] == ["turn_tap.left", "turn_tap.right", "stack_cups.red"]
+    assert all(list(group) == [0] for group in envs.values())
+    assert all(group[0].get_attr("task") == (name,) for name, group in envs.items())
