@@ -11,7 +11,7 @@ import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import lerobot_histmv
 
@@ -74,17 +74,11 @@ def dispatch(name: str, arguments: Sequence[str]) -> None:
 
     A config class with a ``parse`` of its own reads what draccus alone cannot, such as LeRobot's ``--policy.path``.
     """
-    import draccus
+    from dataset_tools import command_line
 
     run, config_class = runner(name)
-    parse = getattr(config_class, "parse", partial(draccus.parse, config_class))
-    run(parse(args=[underscored(word) for word in arguments], prog=f"histmv {name}"))
-
-
-def underscored(word: str) -> str:
-    """``--an-option=value`` as ``--an_option=value``, which is how LeRobot and draccus spell options."""
-    option, equals, value = word.partition("=")
-    return f"--{option[2:].replace('-', '_')}{equals}{value}" if option.startswith("--") else word
+    parse = getattr(config_class, "parse", partial(command_line.parse, config_class))
+    run(parse(args=[command_line.underscored(word) for word in arguments], prog=f"histmv {name}"))
 
 
 def user_errors() -> tuple[type[Exception], ...]:
@@ -94,13 +88,15 @@ def user_errors() -> tuple[type[Exception], ...]:
     return (ValueError, OSError, DraccusException)
 
 
-def reason(error: BaseException) -> BaseException:
-    """What the user should read: draccus reports only the class that refused its values, its cause tells why."""
-    from draccus.utils import DraccusException
+def fail(name: str, error: Exception) -> NoReturn:
+    """Say what was wrong in a sentence and exit."""
+    from dataset_tools.command_line import UsageError, reason
 
-    while isinstance(error, DraccusException) and error.__cause__ is not None:
-        error = error.__cause__
-    return error
+    if isinstance(error, UsageError):
+        print(f"histmv {name}: {error}\n(histmv {name} --help explains the options)", file=sys.stderr)
+        sys.exit(2)
+    print(f"histmv {name}: {reason(error)}\n({TRACEBACK_VARIABLE}=1 shows where this was raised)", file=sys.stderr)
+    sys.exit(1)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -125,5 +121,4 @@ def main(argv: Sequence[str] | None = None) -> None:
     except user_errors() as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        print(f"histmv {name}: {reason(error)}\n({TRACEBACK_VARIABLE}=1 shows where this was raised)", file=sys.stderr)
-        sys.exit(1)
+        fail(name, error)

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import draccus
 from lerobot.configs import parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from dataset_tools import command_line
 from dataset_tools.eval_checkpoint import PolicySource
 
 REPORTED_SEEDS = 200_000
@@ -63,6 +63,6 @@ class EvaluateConfig:
             sys.exit(0)
         path = parser.get_path_arg("policy", arguments)
         overrides = parser.get_cli_overrides("policy", arguments) or []
-        config = draccus.parse(cls, args=parser.filter_path_args("policy", arguments), prog=prog)
+        config: EvaluateConfig = command_line.parse(cls, parser.filter_path_args("policy", arguments), prog)
         config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
         return config

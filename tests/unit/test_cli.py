@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dataset_tools import cli, config_files
+from dataset_tools import cli, command_line, config_files
 
 
 @dataclass
@@ -34,8 +34,8 @@ def fake_command(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("word", ["--size=-7", "--si-ze=3"])
 def test_options_may_be_spelt_with_dashes(word: str) -> None:
-    assert cli.underscored(word) == {"--size=-7": "--size=-7", "--si-ze=3": "--si_ze=3"}[word]
-    assert cli.underscored("a-b") == "a-b"
+    assert command_line.underscored(word) == {"--size=-7": "--size=-7", "--si-ze=3": "--si_ze=3"}[word]
+    assert command_line.underscored("a-b") == "a-b"
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS.keys() - {"eval"}))
@@ -86,8 +86,27 @@ def test_unknown_option_is_refused(fake_command: list[int], capsys: pytest.Captu
     with pytest.raises(SystemExit) as stop:
         cli.main(["fake", "--sise=7"])
     assert stop.value.code == 2
-    assert "--sise=7" in capsys.readouterr().err
+    assert "--sise is not an option, did you mean --size?" in capsys.readouterr().err
     assert fake_command == []
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--env.disturbances.fog=1", "--env.disturbances.rgb_noise"),
+        ("--seed=1.5", "`seed`: Couldn't parse '1.5' into an int"),
+        ("--env.image_size=large", "`env.image_size`: Couldn't parse 'large' into an int"),
+        ("--env.disturbances.depth=-1", "disturbances.depth is -1.0; it must not be negative"),
+        ("--env.task=nope", "accepted are reach_target, "),
+    ],
+)
+def test_a_wrong_option_is_named_with_what_exists(
+    option: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(cli.TRACEBACK_VARIABLE, raising=False)
+    with pytest.raises(SystemExit):
+        cli.main(["record", "--env.task=turn_tap", option])
+    assert message in capsys.readouterr().err
 
 
 def test_a_users_mistake_gives_one_sentence_and_a_traceback_on_request(
