@@ -1,7 +1,9 @@
 """Do the key poses work? Each episode's are executed in the scene in which it was recorded."""
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from jaxtyping import Float32
 from dataset_tools.keyframes import Keyframing
 from dataset_tools.record_place import RECORDING_FILE
 from lerobot_histmv import keys
+from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 
 IMAGE_SIZE = 8
 """Nobody looks: the smallest image [pixels] that the environment renders."""
@@ -19,11 +22,12 @@ IMAGE_SIZE = 8
 
 @dataclass(frozen=True)
 class Scenes:
-    """What the recorded episodes took place in: the task, and per episode the scene's seed and the variation."""
+    """What the recorded episodes took place in: per episode the task, the scene's seed and the variation."""
 
-    task: str
+    tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     variations: tuple[int, ...]
+    disturbances: Disturbances = CLEAN
 
 
 def read_scenes(root: Path, episodes: int) -> Scenes:
@@ -42,7 +46,8 @@ def read_scenes(root: Path, episodes: int) -> Scenes:
     told = json.loads(path.read_text(encoding="utf-8"))
     if len(told["seeds"]) != episodes:
         raise ValueError(f"replay needs one scene per episode, but {path} tells {len(told['seeds'])} of {episodes}")
-    return Scenes(told["settings"]["task"], tuple(told["seeds"]), tuple(told["variations"]))
+    disturbances = Disturbances(**told["settings"]["disturbances"])
+    return Scenes(tuple(told["tasks"]), tuple(told["seeds"]), tuple(told["variations"]), disturbances)
 
 
 def replay(scenes: Scenes, actions: Mapping[int, Float32[np.ndarray, "k a"]]) -> Iterator[tuple[int, str]]:
@@ -55,19 +60,21 @@ def replay(scenes: Scenes, actions: Mapping[int, Float32[np.ndarray, "k a"]]) ->
     Raises:
         ValueError: the actions are not tool pose and gripper (``keys.POSE_NAMES``).
     """
+    for task, episodes in itertools.groupby(actions, key=lambda episode: scenes.tasks[episode]):
+        with closing(_make(task, scenes.disturbances)) as env:
+            for episode in episodes:
+                rows = actions[episode]
+                if rows.shape[1] != len(keys.POSE_NAMES):
+                    wanted = ", ".join(keys.POSE_NAMES)
+                    raise ValueError(f"replay needs actions of {wanted}; these have {rows.shape[1]} entries")
+                env.reset(seed=scenes.seeds[episode], options={"variation": scenes.variations[episode]})
+                yield episode, _failure(env, rows)
+
+
+def _make(task: str, disturbances: Disturbances) -> Any:
     from lerobot_histmv.envs import make
 
-    env = make(scenes.task, cameras=("front",), image_size=IMAGE_SIZE, render_size=IMAGE_SIZE)
-    try:
-        for episode, rows in actions.items():
-            if rows.shape[1] != len(keys.POSE_NAMES):
-                raise ValueError(
-                    f"replay needs actions of {', '.join(keys.POSE_NAMES)}; these have {rows.shape[1]} entries"
-                )
-            env.reset(seed=scenes.seeds[episode], options={"variation": scenes.variations[episode]})
-            yield episode, _failure(env, rows)
-    finally:
-        env.close()
+    return make(task, cameras=("front",), image_size=IMAGE_SIZE, render_size=IMAGE_SIZE, disturbances=disturbances)
 
 
 def without_failures(found: Mapping[int, Keyframing], failures: Mapping[int, str]) -> dict[int, Keyframing]:

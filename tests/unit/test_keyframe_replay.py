@@ -1,6 +1,7 @@
 """Replaying key poses: scenes come from the recording, the environment decides, and what fails is told."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from dataset_tools.keyframes import KeyframeOptions, extract
 from dataset_tools.replay import Scenes, read_scenes, replay, without_failures
 from dataset_tools.report import Report
 from dataset_tools.signals import Trajectory
+from lerobot_histmv.envs.disturbances import Disturbances
 
-SCENES = Scenes("push_buttons", seeds=(11, 13, 17), variations=(2, 3, 5))
+SCENES = Scenes(("push_buttons", "turn_tap.left", "push_buttons"), seeds=(11, 13, 17), variations=(2, 3, 5))
 
 
 class FakeEnv:
@@ -65,10 +67,13 @@ def test_actions_that_are_no_tool_poses_are_refused(env: FakeEnv) -> None:
 def test_scenes_are_read_from_the_recording(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="other data have no scene"):
         read_scenes(tmp_path, 3)
-    told = {"settings": {"task": "push_buttons"}, "seeds": [11, 13, 17], "variations": [2, 3, 5]}
+    told = {
+        "settings": {"disturbances": {"distractors": 2}}, "tasks": list(SCENES.tasks),
+        "seeds": [11, 13, 17], "variations": [2, 3, 5],
+    }  # fmt: skip
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta/recording.json").write_text(json.dumps(told))
-    assert read_scenes(tmp_path, 3) == SCENES
+    assert read_scenes(tmp_path, 3) == replace(SCENES, disturbances=Disturbances(distractors=2))
     with pytest.raises(ValueError, match="tells 3 of 2"):
         read_scenes(tmp_path, 2)
 
