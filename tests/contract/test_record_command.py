@@ -16,6 +16,7 @@ from dataset_tools.record import RecordConfig, checked_settings, run
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.record_report import default_root
 from dataset_tools.record_settings import RecordSettings
+from dataset_tools.replay import read_scenes
 from lerobot_histmv.envs.tasks.suites import SUITES
 
 EPISODES = 7
@@ -41,6 +42,7 @@ def test_first_successes_are_kept_and_told(uninterrupted: Path) -> None:
     assert report["success_rate"] == pytest.approx(EPISODES / report["attempts"])
     assert report["settings"]["cameras"] == list(CAMERAS)
     assert report["versions"]["lerobot"]
+    assert read_scenes(uninterrupted, EPISODES).seeds == tuple(SUCCESSES)
     assert sorted(path.name for path in uninterrupted.parent.iterdir()) == ["data"]
 
 
