@@ -18,6 +18,10 @@ from lerobot_histmv.envs.motion import TICK
 
 END_FRAMES = 20
 """The last picture of a video stays for a second."""
+LOOK_AT = (0.4, 0.0, 0.1)
+"""What the window shows first [m] ..."""
+LOOK_FROM = (1.6, 150.0, -30.0)
+"""... and from where: distance [m], azimuth and elevation [degrees]."""
 
 
 def has_display() -> bool:
@@ -68,6 +72,8 @@ def run(config: ViewConfig) -> None:
                     env.execute(motion)
             outcome = "success" if env.is_success() else env.failure()
             console.print(f"{options.task}, scene {seed}: {info['instruction']}: {outcome}", soft_wrap=True)
+        if config.window:
+            console.print("close the window to end")
     env.close()
     if not config.window:
         console.print(f"video: {path}", soft_wrap=True)
@@ -88,12 +94,15 @@ def film(env: UR5Env, path: Path) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def window(env: UR5Env) -> Iterator[Callable[[], None]]:
-    """A function that shows the scene in MuJoCo's viewer in real time; closing the viewer ends the program."""
+    """A function that shows the scene in MuJoCo's viewer in real time; it stays open until someone closes it."""
     import mujoco.viewer
 
     env.reset(seed=0)
     simulation = env.stage.simulation
-    with mujoco.viewer.launch_passive(simulation.model, simulation.data) as viewer:
+    model, data = simulation.model, simulation.data
+    with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
+        viewer.cam.lookat[:] = LOOK_AT
+        viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = LOOK_FROM
 
         def show() -> None:
             if not viewer.is_running():
@@ -102,3 +111,5 @@ def window(env: UR5Env) -> Iterator[Callable[[], None]]:
             time.sleep(TICK)
 
         yield show
+        while viewer.is_running():
+            time.sleep(TICK)
