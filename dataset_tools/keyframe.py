@@ -81,6 +81,10 @@ class KeyframeConfig:
     seed: int = 0
     # Key poses per episode at most, unless more are mandatory.
     most: int = MOST
+    # Exactly so many key poses per episode (all mandatory ones included) instead of the fewest within epsilon.
+    k: int | None = None
+    # Frames that must be key poses, by episode: {0: [12, 40], 3: [7]}.
+    keep: dict[int, list[int]] = field(default_factory=dict)
     # What counts as a pause.
     pause: PauseOptions = field(default_factory=PauseOptions)
     # Settings of the genetic algorithm.
@@ -100,6 +104,7 @@ class KeyframeConfig:
             rotation_scale=self.rotation_scale,
             seed=self.seed,
             most=self.most,
+            k=self.k,
             pause=self.pause,
             genetic=self.genetic,
         )
@@ -122,7 +127,9 @@ def run(config: KeyframeConfig) -> None:
     with build.published(root, config.overwrite) as partial, Progress(console=console) as progress:
         options = config.options()
         chosen = progress.track(demonstrations.trajectories.items(), description="choosing keyframes")
-        found = {number: extract(trajectory, options, number) for number, trajectory in chosen}
+        found = {
+            number: extract(trajectory, options, number, config.keep.get(number, ())) for number, trajectory in chosen
+        }
         failures = {} if config.replay == "off" else replay_all(demonstrations, found, progress)
         if config.replay == "drop":
             found = without_failures(found, failures)

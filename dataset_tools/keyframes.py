@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -17,6 +18,8 @@ from dataset_tools.simplify import Method
 
 FEWEST, MOST = 2, 30
 """Numbers of keyframes the paper allows; more mandatory ones are all kept."""
+OWN_NUMBER = ("awe", "heuristic")
+"""Methods that find their number of keyframes by themselves."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class KeyframeOptions:
         rotation_scale: how many metres a radian of rotation counts as; 0 ignores rotation, as the paper does.
         seed: makes the genetic algorithm repeatable.
         most: keyframes per episode at most, unless more are mandatory.
+        k: exactly so many keyframes per episode instead, unless more are mandatory or the episode has fewer frames;
+            epsilon then decides nothing.
         nodes: longer paths are thinned to about so many frames for the search (its time grows with the cube).
         pause: what a pause is.
         genetic: settings of the genetic algorithm.
@@ -42,6 +47,7 @@ class KeyframeOptions:
     rotation_scale: float = 0.0
     seed: int = 0
     most: int = MOST
+    k: int | None = None
     nodes: int = 600
     pause: PauseOptions = field(default_factory=PauseOptions)
     genetic: GeneticOptions = field(default_factory=GeneticOptions)
@@ -53,6 +59,10 @@ class KeyframeOptions:
             raise ValueError(f"rotation_scale is {self.rotation_scale}; it must be at least 0 metres per radian")
         if self.most < FEWEST:
             raise ValueError(f"most is {self.most}; at least {FEWEST} keyframes are needed")
+        if self.k is not None and self.k < FEWEST:
+            raise ValueError(f"k is {self.k}; at least {FEWEST} keyframes are needed")
+        if self.k is not None and self.method in OWN_NUMBER:
+            raise ValueError(f"k is {self.k}, but the method {self.method} finds its number of keyframes by itself")
         if self.nodes < 2 * self.most:
             raise ValueError(f"nodes is {self.nodes}; it must be at least twice `most` ({self.most})")
 
@@ -84,16 +94,24 @@ class Keyframing:
     warning: str
 
 
-def extract(trajectory: Trajectory, options: KeyframeOptions, episode: int = 0) -> Keyframing:
-    """Keyframes of one episode; the same options, episode number and data always give the same ones.
+def extract(
+    trajectory: Trajectory, options: KeyframeOptions, episode: int = 0, asked: Collection[int] = ()
+) -> Keyframing:
+    """Keyframes of one episode; the same arguments always give the same ones.
+
+    Args:
+        trajectory: the episode.
+        options: how they are chosen.
+        episode: its number, which is part of the genetic algorithm's seed.
+        asked: frames that must be keyframes.
 
     Raises:
-        ValueError: if the episode has fewer than two frames, as one macro step needs two.
+        ValueError: the episode has fewer than two frames, as one macro step needs two, or lacks an asked one.
     """
     if len(trajectory) < FEWEST:
         raise ValueError(f"the episode has {len(trajectory)} frame(s); a macro step needs at least {FEWEST}")
     begin = time.thread_time()
-    mandatory = mandatory_keyframes(trajectory, options.pause)
+    mandatory = mandatory_keyframes(trajectory, options.pause, asked)
     frames = moving_frames(mandatory)
     nodes = _thinned(frames, mandatory, options.nodes)
     points = curve(trajectory, options.rotation_scale)
@@ -148,9 +166,9 @@ def _thinned(frames: Int[np.ndarray, " m"], mandatory: list[Keyframe], nodes: in
 
 
 def _choose(problem: Problem, options: KeyframeOptions, episode: int) -> Int[np.ndarray, " k"]:
-    """Selection by the wanted method with the fewest keyframes that keep the mean error within epsilon."""
+    """Selection by the wanted method: of k keyframes, or the fewest that keep the mean error within epsilon."""
     low = len(problem.mandatory)
-    high = max(low, min(options.most, len(problem.points)))
+    high = max(low, min(options.k or options.most, len(problem.points)))
     limit = options.epsilon * len(problem.points)
 
     def good(selection: Int[np.ndarray, " k"]) -> bool:
@@ -160,14 +178,21 @@ def _choose(problem: Problem, options: KeyframeOptions, episode: int) -> Int[np.
         return problem.mandatory
     if options.method == "awe":
         return simplify.awe(problem, options.epsilon)
-    if options.method == "exact":
-        return simplify.fewest(exact.solve(problem, high).selection, low, high, good)
-    if options.method == "ga":
+    choose = _chooser(problem, options, episode, high)
+    if options.k is not None:
+        return choose(high)
+    if options.method == "ga":  # it is never worse than its start, so it needs no more than Ramer-Douglas-Peucker
         high = next(len(grown) for grown in simplify.growing(problem) if len(grown) == high or good(grown))
-        choose = partial(simplify.genetic, problem, entropy=(options.seed, episode), options=options.genetic)
-        return simplify.fewest(choose, low, high, good)
-    method = simplify.rdp if options.method == "rdp" else simplify.uniform
-    return simplify.fewest(partial(method, problem), low, high, good)
+    return simplify.fewest(choose, low, high, good)
+
+
+def _chooser(problem: Problem, options: KeyframeOptions, episode: int, most: int) -> simplify.Chooser:
+    """The wanted method as a function of the number of keyframes, up to ``most``."""
+    if options.method == "exact":
+        return exact.solve(problem, most).selection
+    if options.method == "ga":
+        return partial(simplify.genetic, problem, entropy=(options.seed, episode), options=options.genetic)
+    return partial(simplify.rdp if options.method == "rdp" else simplify.uniform, problem)
 
 
 def _gap(error: float, optimum: float) -> float:
@@ -180,6 +205,8 @@ def _warning(mandatory: int, kept: int, error_mean: float, options: KeyframeOpti
         return f"{mandatory} keyframes are mandatory, more than {options.most}: all are kept"
     if options.method == "awe" and kept > options.most:
         return f"{kept} keyframes are needed, more than {options.most}: all are kept"
-    if options.method not in ("awe", "heuristic") and error_mean > options.epsilon:
+    if options.k is not None:
+        return f"{kept} keyframes are kept, not {options.k}" if kept != options.k else ""
+    if options.method not in OWN_NUMBER and error_mean > options.epsilon:
         return f"mean error {error_mean:.4g} with {kept} keyframes is above epsilon {options.epsilon:.4g}"
     return ""

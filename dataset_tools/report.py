@@ -20,8 +20,8 @@ FORMAT = 1
 GAP_COUNTS_ABOVE = 1e-3
 """The median gap is over episodes whose optimum is above this mean error [m per frame]; elsewhere it is noise."""
 
-_MARKS = {"start": "s", "pause": "p", "gripper": "g", "ga": "+", "end": "e"}
-_LEGEND = "pose frames: s start, p pause, g gripper change, + chosen by the method, e end"
+_MARKS = {"start": "s", "pause": "p", "gripper": "g", "ga": "+", "end": "e", "user": "u"}
+_LEGEND = "pose frames: s start, p pause, g gripper change, + chosen by the method, e end, u asked for"
 
 
 @dataclass(frozen=True)

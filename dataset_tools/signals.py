@@ -4,6 +4,7 @@ A keyframe has two frames. At its *pose frame* the arm has arrived (and a grippe
 frame* is the last one before the arm moves on, so that the gripper has settled.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -95,11 +96,19 @@ def gripper_changes(gripper: Float[np.ndarray, " n"] | None) -> list[int]:
     return [] if gripper is None else (np.flatnonzero(np.diff(gripper)) + 1).tolist()
 
 
-def mandatory_keyframes(trajectory: Trajectory, options: PauseOptions) -> list[Keyframe]:
+def mandatory_keyframes(trajectory: Trajectory, options: PauseOptions, asked: Collection[int] = ()) -> list[Keyframe]:
     """Keyframes that every method keeps, in order: the first has pose frame 0, the last is observed at the last frame.
 
     A pause is one keyframe; one that holds a gripper change is that change's, one at either end of the episode is the
     start's or the end's. Spans from pose to observation frame do not overlap.
+
+    Args:
+        trajectory: the episode.
+        options: what a pause is.
+        asked: frames that the user wants; one inside the span of another keyframe is that keyframe already.
+
+    Raises:
+        ValueError: the episode has no such frame.
     """
     last = len(trajectory) - 1
     spans = pauses(trajectory, options)
@@ -112,10 +121,24 @@ def mandatory_keyframes(trajectory: Trajectory, options: PauseOptions) -> list[K
     ordered = [Keyframe(0, waiting, "start"), *sorted(found, key=lambda frame: frame.pose_frame)]
     if len(ordered) == 1 or ordered[-1].observation_frame < last:
         ordered.append(Keyframe(last, last, "end"))
+    ordered = _with_asked(ordered, asked, last)
     return [
         replace(frame, observation_frame=min(frame.observation_frame, following.pose_frame - 1))
         for frame, following in pairwise(ordered)
     ] + ordered[-1:]
+
+
+def _with_asked(keyframes: list[Keyframe], asked: Collection[int], last: int) -> list[Keyframe]:
+    """All keyframes in order, with those that the user asks for."""
+    outside = [frame for frame in asked if not 0 <= frame <= last]
+    if outside:
+        raise ValueError(f"frames {outside} are asked for, but the episode has frames 0 to {last}")
+    new = [
+        Keyframe(frame, frame, "user")
+        for frame in sorted(set(asked))
+        if not any(known.pose_frame <= frame <= known.observation_frame for known in keyframes)
+    ]
+    return sorted([*keyframes, *new], key=lambda keyframe: keyframe.pose_frame)
 
 
 def _gripper_keyframes(trajectory: Trajectory, spans: list[Span], options: PauseOptions) -> list[Keyframe]:

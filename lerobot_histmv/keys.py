@@ -29,7 +29,7 @@ SOURCE_EPISODE = "keyframe.source_episode"
 SOURCE_FRAME = "keyframe.source_frame"
 SOURCE_TIMESTAMP = "keyframe.source_timestamp"
 REASON = "keyframe.reason"
-REASONS = ("start", "pause", "gripper", "ga", "end")
+REASONS = ("start", "pause", "gripper", "ga", "end", "user")
 """Why a keyframe was kept; ``keyframe.reason`` stores the index into this tuple."""
 
 INSTRUCTIONS_FILE = "meta/instructions.json"

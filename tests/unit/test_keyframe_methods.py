@@ -114,6 +114,24 @@ def test_every_method_gives_the_same_kind_of_result(method: str) -> None:
         assert found.error_mean <= 0.01
 
 
+@pytest.mark.parametrize("method", ["ga", "exact", "rdp", "uniform"])
+def test_a_fixed_k_is_kept_whatever_epsilon_says(method: str) -> None:
+    found = extract(bends(4), KeyframeOptions(method=method, k=11, epsilon=1.0))  # type: ignore[arg-type]
+    assert len(found.keyframes) == 11
+    assert not found.warning
+    short = extract(bends(4, n=7), KeyframeOptions(method=method, k=11))  # type: ignore[arg-type]
+    assert len(short.keyframes) == 7
+    assert short.warning == "7 keyframes are kept, not 11"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_asked_frames_are_kept_by_every_method(method: str) -> None:
+    found = extract(bends(4), KeyframeOptions(method=method, epsilon=0.01), asked=(0, 31, 13, 31))  # type: ignore[arg-type]
+    assert [frame.pose_frame for frame in found.keyframes if frame.reason == "user"] == [13, 31]
+    with pytest.raises(ValueError, match=r"frames \[97\] are asked for, but the episode has frames 0 to 96"):
+        extract(bends(4), KeyframeOptions(), asked=(97,))
+
+
 def test_rotation_enters_through_its_scale() -> None:
     turn = np.concatenate([np.zeros(20), np.linspace(0, 1.5, 21)])
     path = np.linspace([0.0, 0, 0], [0.4, 0, 0], 41)
@@ -159,6 +177,8 @@ def test_asking_the_judge_for_an_impossible_number_lists_the_possible_ones() -> 
         ({"most": 1}, "at least 2"),
         ({"rotation_scale": -1.0}, "at least 0"),
         ({"nodes": 31}, "twice"),
+        ({"k": 1}, "at least 2"),
+        ({"k": 5, "method": "awe"}, "finds its number of keyframes by itself"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(wrong: dict[str, object], message: str) -> None:

@@ -117,7 +117,7 @@ def test_the_pose_of_a_pause_is_taken_once_the_arm_has_arrived() -> None:
 
 
 def test_every_reason_has_a_number_in_the_data() -> None:
-    assert {"start", "pause", "gripper", "ga", "end"} == set(keys.REASONS)
+    assert {"start", "pause", "gripper", "ga", "end", "user"} == set(keys.REASONS)
 
 
 def test_a_keyframe_rests_if_it_is_seen_later_than_its_pose() -> None:
