@@ -181,7 +181,7 @@ def test_a_stopped_run_goes_on_with_the_missing_episodes(dense: Path, monkeypatc
     monkeypatch.setattr(keyframe_worker, "extract", extract_or_stop)
     with pytest.raises(KeyboardInterrupt):
         run(config(dense))
-    with pytest.raises(ValueError, match="epsilon was 0.005 and is now 0.1"):
+    with pytest.raises(ValueError, match=r"epsilon was 0\.005 and is now 0\.1"):
         run(config(dense, epsilon=0.1))
     run(config(dense))
     assert chosen == [0, -1, 1]

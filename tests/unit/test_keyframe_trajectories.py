@@ -1,5 +1,7 @@
 """Trajectories and labels out of columns: one quaternion order, one meaning of the gripper, checked numbers."""
 
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from dataset_tools.columns import Column, Columns
 from dataset_tools.demonstrations import gripper_ends
 from dataset_tools.signals import Keyframe, Trajectory
+from dataset_tools.source import Source
 from dataset_tools.trajectories import command, label_names, labels, trajectory_of
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import canonical
@@ -52,15 +55,18 @@ def test_the_gripper_becomes_one_or_zero_whatever_its_range_and_small_wobbles_do
     assert command(1 - 2 * opening, (1.0, -1.0)).tolist() == expected
 
 
-class Recorded:
-    """Stands for a dataset with gripper commands by episode."""
+class Recorded(Source):
+    """A dataset that has nothing but gripper commands by episode."""
+
+    commands: dict[int, list[float]]
 
     def __init__(self, commands: dict[int, list[float]]) -> None:
-        self.commands, self.episodes = commands, tuple(commands)
+        object.__setattr__(self, "commands", commands)
+        object.__setattr__(self, "episodes", tuple(commands))
 
-    def vectors(self, episode: int, wanted: list[str]) -> dict[str, np.ndarray]:
+    def vectors(self, episode: int, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
         assert wanted == ["action"]
-        return {"action": np.array(self.commands[episode])[:, None]}
+        return {"action": np.array(self.commands[episode], dtype=np.float64)[:, None]}
 
 
 def test_the_range_of_an_unknown_gripper_is_that_of_all_episodes() -> None:
