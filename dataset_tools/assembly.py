@@ -1,6 +1,7 @@
 """Finished shards -> one LeRobot v3 dataset, episode by episode, through LeRobot's own metadata writer."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,10 +15,23 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import update_chunk_file_indices
 
 from dataset_tools.dense_features import ROBOT_TYPE
-from dataset_tools.shards import Outcome, shard_path, write_json
+from dataset_tools.shards import Outcome, Statistics, as_arrays, shard_path, write_json
 from lerobot_histmv import keys
 
-Statistics = dict[str, dict[str, np.ndarray]]
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One finished episode.
+
+    Attributes:
+        table: its rows, without the columns that LeRobot adds.
+        tasks: instruction of each row.
+        statistics: LeRobot's, of those columns whose statistics are known already.
+    """
+
+    table: pa.Table
+    tasks: Sequence[str]
+    statistics: Statistics
 
 
 def assemble(
@@ -28,7 +42,7 @@ def assemble(
     repo_id: str,
     root: Path,
 ) -> None:
-    """Write the dataset that holds the shards of ``episodes``, in their order.
+    """Write the dataset that holds the shards of recorded ``episodes``, in their order.
 
     Args:
         directory: where the shards lie.
@@ -38,20 +52,48 @@ def assemble(
         repo_id: name of the dataset.
         root: where to write it; must not exist.
     """
-    meta = LeRobotDatasetMetadata.create(
-        repo_id, fps, dict(features), robot_type=ROBOT_TYPE, root=root, use_videos=False
-    )
     paraphrases: dict[str, list[str]] = {}
-    with DataFiles(meta) as files:
+
+    def recorded() -> Iterator[Episode]:
         for outcome in episodes:
-            meta.save_episode_tasks([outcome.instruction])
-            table = _numbered(pq.read_table(shard_path(directory, outcome.attempt)), meta, outcome.instruction)
-            place = files.append(table)
-            statistics = _statistics(table, outcome)
-            meta.save_episode(meta.total_episodes, table.num_rows, [outcome.instruction], statistics, place)
+            table = pq.read_table(shard_path(directory, outcome.attempt))
+            yield Episode(table, [outcome.instruction] * table.num_rows, as_arrays(outcome.statistics))
             paraphrases[outcome.instruction] = outcome.paraphrases
-    meta.finalize()
+
+    write_dataset(recorded(), features, fps, repo_id, root, ROBOT_TYPE)
     write_json(root / keys.INSTRUCTIONS_FILE, paraphrases)
+
+
+def write_dataset(
+    episodes: Iterable[Episode],
+    features: Mapping[str, dict[str, Any]],
+    fps: int,
+    repo_id: str,
+    root: Path,
+    robot_type: str | None,
+) -> None:
+    """Write a LeRobot dataset of image features, one episode after the other; memory holds one of them.
+
+    Args:
+        episodes: rows with the columns of ``features``.
+        features: LeRobot features.
+        fps: frames per second.
+        repo_id: name of the dataset.
+        root: where to write it; must not exist.
+        robot_type: name of the robot, None if it is not known.
+    """
+    meta = LeRobotDatasetMetadata.create(
+        repo_id, fps, dict(features), robot_type=robot_type, root=root, use_videos=False
+    )
+    with DataFiles(meta) as files:
+        for episode in episodes:
+            tasks = list(dict.fromkeys(episode.tasks))
+            meta.save_episode_tasks(tasks)
+            table = _numbered(episode.table, meta, episode.tasks)
+            place = files.append(table)
+            statistics = _statistics(table, episode.statistics)
+            meta.save_episode(meta.total_episodes, table.num_rows, tasks, statistics, place)
+    meta.finalize()
 
 
 class DataFiles:
@@ -108,7 +150,7 @@ class DataFiles:
         self.close()
 
 
-def _numbered(table: pa.Table, meta: LeRobotDatasetMetadata, instruction: str) -> pa.Table:
+def _numbered(table: pa.Table, meta: LeRobotDatasetMetadata, tasks: Sequence[str]) -> pa.Table:
     """The shard with the columns that LeRobot adds: time and the indices of frame, episode, row and task."""
     rows = np.arange(table.num_rows)
     numbering = {
@@ -116,20 +158,18 @@ def _numbered(table: pa.Table, meta: LeRobotDatasetMetadata, instruction: str) -
         "frame_index": rows,
         "episode_index": np.full_like(rows, meta.total_episodes),
         "index": meta.total_frames + rows,
-        "task_index": np.full_like(rows, meta.get_task_index(instruction)),
+        "task_index": np.array([meta.get_task_index(task) for task in tasks]),
     }
     for name, column in numbering.items():
         table = table.append_column(name, pa.array(column))
     return table
 
 
-def _statistics(table: pa.Table, outcome: Outcome) -> Statistics:
-    """LeRobot's statistics: those of the images from the shard, those of all other columns from LeRobot."""
-    statistics: Statistics = {}
+def _statistics(table: pa.Table, known: Statistics) -> Statistics:
+    """LeRobot's statistics of all columns; text has none."""
+    statistics = dict(known)
     for name in table.column_names:
-        if name in outcome.statistics:
-            statistics[name] = {stat: np.array(value) for stat, value in outcome.statistics[name].items()}
-        else:
+        if name not in known and not pa.types.is_string(table[name].type):
             column = np.array(table[name].to_pylist(), dtype=_numpy_type(table[name].type))
             statistics[name] = get_feature_stats(column, axis=0, keepdims=column.ndim == 1)
     return statistics

@@ -1,20 +1,18 @@
 """Attempts made by worker processes until a recording has its episodes."""
 
 import multiprocessing
-import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 
+from dataset_tools.pool import one_thread_each
 from dataset_tools.record_settings import SEED_LIMIT
 from dataset_tools.record_worker import WorkerSetup, make_attempt, start_worker
 from dataset_tools.shards import Outcome, missing_attempts
 
 TOLERATED_FAILURES = 20
 """A recording gives up when more attempts than this, and more than have succeeded, have failed."""
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 
 
 def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome], episodes: int) -> Iterator[Outcome]:
@@ -33,7 +31,7 @@ def make_attempts(setup: WorkerSetup, workers: int, outcomes: dict[int, Outcome]
     """
     context = multiprocessing.get_context("spawn")
     pending: dict[Future[Outcome], int] = {}
-    with _one_thread_each(), ProcessPoolExecutor(workers, context, start_worker, (setup,)) as pool:
+    with one_thread_each(), ProcessPoolExecutor(workers, context, start_worker, (setup,)) as pool:
         try:
             while missing := missing_attempts(outcomes, episodes, len(setup.tasks)):
                 _check_sense(setup.seed + max(missing), outcomes)
@@ -70,18 +68,3 @@ def _check_sense(last_seed: int, outcomes: dict[int, Outcome]) -> None:
     if failed > max(TOLERATED_FAILURES, len(outcomes) - failed):
         kinds = ", ".join(f"{kind}: {number}" for kind, number in failures.most_common())
         raise RuntimeError(f"{failed} of {len(outcomes)} attempts failed ({kinds}); the expert does not fit the scene")
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started inside use one thread each for arithmetic and software rendering."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -1,31 +1,30 @@
-"""Writing a keyframed LeRobot dataset: one row per macro step, its provenance, and how it was made.
+"""Rows of a keyframed LeRobot dataset: one per macro step, with its provenance.
 
 Of an episode's k keyframes, row i holds what was seen at keyframe i (its observation frame) and, as the action, the
-pose and gripper command of keyframe i + 1. The dataset appears under its name only when it is whole.
+pose and gripper command of keyframe i + 1.
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from jaxtyping import Float32
+from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from dataset_tools.assembly import DataFiles
 from dataset_tools.columns import Columns
-from dataset_tools.demonstrations import Demonstrations
 from dataset_tools.frames import CameraFrames, camera_frames
 from dataset_tools.images import image_statistics
 from dataset_tools.keyframes import Keyframing
-from dataset_tools.signals import Trajectory
+from dataset_tools.shards import Statistics
 from dataset_tools.source import Source
-from dataset_tools.trajectories import label_names, labels
+from dataset_tools.trajectories import label_names
 from lerobot_histmv import keys
 
 FPS = 1
@@ -39,7 +38,10 @@ _PROVENANCE = {
 }
 
 
-def keyframed_features(source: Source, columns: Columns) -> dict[str, dict[str, Any]]:
+Features = dict[str, dict[str, Any]]
+
+
+def keyframed_features(source: Source, columns: Columns) -> Features:
     """LeRobot features of the keyframed dataset: all ``observation.*`` with cameras as images, action, provenance."""
     features = {}
     for key in observed(source):
@@ -60,113 +62,74 @@ def observed(source: Source) -> list[str]:
     return [key for key in source.features if key.startswith(keys.OBS_PREFIX)]
 
 
-def write_dataset(
-    root: Path,
-    demonstrations: Demonstrations,
-    found: Mapping[int, Keyframing],
-    repo_id: str,
-    on_episode: Callable[[], None] = lambda: None,
-) -> list[str]:
-    """Write the rows of all episodes in ``found``.
+def rows(
+    source: Source, keyframing: Keyframing, action: Float32[np.ndarray, "k a"], episode: int
+) -> tuple[dict[str, Any], list[str], list[str]]:
+    """Rows of one episode.
 
     Args:
-        root: where to; must not exist.
-        demonstrations: the dense data.
-        found: keyframes by episode.
-        repo_id: name of the new dataset.
-        on_episode: called after each.
+        source: the dense data.
+        keyframing: the episode's keyframes.
+        action: labels of the keyframes after the first.
+        episode: its number.
 
     Returns:
-        Warnings about what was written (depth images without a single measurement).
+        Columns by name (arrays or camera frames), the instruction of each row, and warnings about what was seen.
 
     Raises:
         ValueError: see ``frames.camera_frames``.
     """
-    source, columns = demonstrations.source, demonstrations.columns
-    features = keyframed_features(source, columns)
-    meta = LeRobotDatasetMetadata.create(
-        repo_id, FPS, features, robot_type=source.meta.robot_type, root=root, use_videos=False
-    )
-    warnings = []
-    with DataFiles(meta) as files:
-        for episode, keyframing in found.items():
-            rows, blank = _rows(source, demonstrations.trajectories[episode], keyframing, episode)
-            warnings += blank
-            tasks = rows.pop("task")
-            meta.save_episode_tasks(list(dict.fromkeys(tasks)))
-            statistics = _statistics(rows, meta.features)
-            place = files.append(_table(rows, tasks, meta))
-            meta.save_episode(meta.total_episodes, len(tasks), list(dict.fromkeys(tasks)), statistics, place)
-            on_episode()
-    meta.finalize()
-    instructions = source.root / keys.INSTRUCTIONS_FILE
-    if instructions.is_file():
-        shutil.copyfile(instructions, root / keys.INSTRUCTIONS_FILE)
-    return warnings
-
-
-def _rows(
-    source: Source, trajectory: Trajectory, keyframing: Keyframing, episode: int
-) -> tuple[dict[str, Any], list[str]]:
-    """Columns of one episode's rows by name (arrays, camera frames, instructions), and warnings."""
     seen = keyframing.keyframes[:-1]
     frames = [keyframe.observation_frame for keyframe in seen]
     kept = [key for key in observed(source) if source.features[key]["dtype"] != "video"]
     stored = source.table(episode, [*kept, "timestamp", "task_index"], frames)
-    rows: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     warnings = []
     for key in observed(source):
         dtype = source.features[key]["dtype"]
         if dtype not in ("image", "video"):
-            rows[key] = np.array(stored.column(key).to_pylist(), dtype=object if dtype == "string" else dtype)
+            columns[key] = np.array(stored.column(key).to_pylist(), dtype=object if dtype == "string" else dtype)
             continue
-        rows[key] = camera_frames(source, episode, key, frames, stored)
+        columns[key] = camera_frames(source, episode, key, frames, stored)
         if key in source.depth_keys:
-            blank = np.flatnonzero(~rows[key].pixels.any(axis=(1, 2, 3)))
+            blank = np.flatnonzero(~columns[key].pixels.any(axis=(1, 2, 3)))
             warnings += [f"episode {episode}, frame {frames[i]}: {key} has no valid depth at all" for i in blank]
-    rows[keys.ACTION] = labels(trajectory, keyframing.keyframes[1:])
-    rows[keys.SOURCE_EPISODE] = np.full(len(frames), episode)
-    rows[keys.SOURCE_FRAME] = np.array(frames)
-    rows[keys.SOURCE_TIMESTAMP] = np.array(stored.column("timestamp").to_pylist(), dtype=np.float32)
-    rows[keys.REASON] = np.array([keys.REASONS.index(keyframe.reason) for keyframe in seen])
-    rows["task"] = [source.task(index) for index in stored.column("task_index").to_pylist()]
-    return rows, warnings
+    columns[keys.ACTION] = action
+    columns[keys.SOURCE_EPISODE] = np.full(len(frames), episode)
+    columns[keys.SOURCE_FRAME] = np.array(frames)
+    columns[keys.SOURCE_TIMESTAMP] = np.array(stored.column("timestamp").to_pylist(), dtype=np.float32)
+    columns[keys.REASON] = np.array([keys.REASONS.index(keyframe.reason) for keyframe in seen])
+    return columns, [source.task(index) for index in stored.column("task_index").to_pylist()], warnings
 
 
-def _statistics(rows: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, dict[str, np.ndarray]]:
-    """LeRobot's statistics of one episode; text has none."""
-    statistics = {}
-    for key, column in rows.items():
+def statistics(columns: Mapping[str, Any], features: Features) -> Statistics:
+    """LeRobot's statistics of one episode's columns; text has none."""
+    found = {}
+    for key, column in columns.items():
         if isinstance(column, CameraFrames):
-            statistics[key] = image_statistics(column.pixels)
+            found[key] = image_statistics(column.pixels)
         elif features[key]["dtype"] != "string":
-            values = column.reshape(len(column)) if tuple(features[key]["shape"]) == (1,) else column
-            statistics[key] = get_feature_stats(values, axis=0, keepdims=values.ndim == 1)
-    return statistics
+            values = _flat(column, features[key])
+            found[key] = get_feature_stats(values, axis=0, keepdims=values.ndim == 1)
+    return found
 
 
-def _table(rows: Mapping[str, Any], tasks: list[str], meta: LeRobotDatasetMetadata) -> pa.Table:
-    """Rows with LeRobot's counters, in the form of its data files."""
-    count = np.arange(len(tasks))
-    columns: dict[str, Any] = {
-        "timestamp": count / meta.fps,
-        "frame_index": count,
-        "episode_index": np.full_like(count, meta.total_episodes),
-        "index": meta.total_frames + count,
-        "task_index": np.array([meta.get_task_index(task) for task in tasks]),
-    }
-    for key, column in rows.items():
-        if isinstance(column, CameraFrames):
-            columns[key] = [{"bytes": file, "path": None} for file in column.files]
-        else:
-            columns[key] = column.reshape(len(column)) if tuple(meta.features[key]["shape"]) == (1,) else column
-    schema = get_hf_features_from_features(meta.features).arrow_schema
-    return pa.table([_cells(columns[field.name], field.type) for field in schema], schema=schema)
+def table(columns: Mapping[str, Any], features: Features) -> pa.Table:
+    """One episode's columns in the form of LeRobot's data files."""
+    schema = get_hf_features_from_features(features).arrow_schema
+    return pa.table([_cells(columns[field.name], features[field.name], field.type) for field in schema], schema=schema)
 
 
-def _cells(column: Any, kind: pa.DataType) -> pa.Array:
+def _flat(column: np.ndarray, feature: Mapping[str, Any]) -> np.ndarray:
+    """LeRobot keeps vectors with one entry as plain numbers."""
+    return column.reshape(len(column)) if tuple(feature["shape"]) == (1,) else column
+
+
+def _cells(column: Any, feature: Mapping[str, Any], kind: pa.DataType) -> pa.Array:
     """Arrow array of a column; LeRobot keeps matrices as an extension of nested lists."""
-    values = column.tolist() if isinstance(column, np.ndarray) else column
+    if isinstance(column, CameraFrames):
+        return pa.array([{"bytes": file, "path": None} for file in column.files], kind)
+    values = _flat(column, feature).tolist()
     if isinstance(kind, pa.BaseExtensionType):
         return pa.ExtensionArray.from_storage(kind, pa.array(values, kind.storage_type))
     return pa.array(values, kind)

@@ -1,13 +1,12 @@
 """The episodes to keyframe, read and understood: which columns mean what, and what the dataset lacks."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dataset_tools.column_guesses import resolve
 from dataset_tools.columns import Columns, ColumnsConfig
 from dataset_tools.signals import Trajectory
 from dataset_tools.source import Source
-from dataset_tools.trajectories import GripperEnds, gripper_ends, trajectory_of
+from dataset_tools.trajectories import GripperEnds, trajectory_of
 from lerobot_histmv import keys
 
 _REPLACED = {keys.ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index"}
@@ -21,13 +20,11 @@ class Demonstrations:
         source: the dataset.
         columns: which of its columns are used.
         ends: gripper values that count as closed and open.
-        trajectories: tool motion by episode.
     """
 
     source: Source
     columns: Columns
     ends: GripperEnds
-    trajectories: Mapping[int, Trajectory]
 
     def notices(self) -> list[str]:
         """Sentences about what is missing, assumed or dropped."""
@@ -71,15 +68,40 @@ class Demonstrations:
         return found
 
 
-def read_demonstrations(source: Source, config: ColumnsConfig) -> Demonstrations:
+def understand(source: Source, config: ColumnsConfig) -> Demonstrations:
     """Episodes of ``source``, with columns as configured or guessed.
 
     Raises:
-        ValueError: see ``column_guesses.resolve``, ``Source.vectors`` and ``trajectories``.
+        ValueError: an episode has a single frame; see also ``column_guesses.resolve`` and ``Source.vectors``.
     """
+    short = [episode for episode in source.episodes if source.length(episode) < 2]
+    if short:
+        raise ValueError(
+            f"episode {short[0]} has 1 frame, but a macro step needs 2: leave it out with --dataset.episodes=[...], or "
+            "remove it with lerobot-edit-dataset"
+        )
     columns = resolve(source.features, config)
-    vectors = source.all_vectors()
-    ends = gripper_ends(columns, vectors)
-    fps = float(source.meta.fps)
-    trajectories = {number: trajectory_of(arrays, columns, ends, fps, number) for number, arrays in vectors.items()}
-    return Demonstrations(source, columns, ends, trajectories)
+    return Demonstrations(source, columns, gripper_ends(source, columns))
+
+
+def gripper_ends(source: Source, columns: Columns) -> GripperEnds:
+    """Values that mean closed and open: those of ``columns``, else the ends of the range in the data."""
+    if columns.gripper is None:
+        return 0.0, 1.0
+    if columns.gripper_range is not None:
+        return columns.gripper_range
+    ranges = []
+    for episode in source.episodes:
+        values = columns.gripper.of(source.vectors(episode, [columns.gripper.feature]))
+        ranges.append((float(values.min()), float(values.max())))
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    return (low, high) if low < high else (low - 1, high)
+
+
+def trajectory(source: Source, columns: Columns, ends: GripperEnds, episode: int) -> Trajectory:
+    """Tool motion of one episode.
+
+    Raises:
+        ValueError: see ``Source.vectors`` and ``trajectories``.
+    """
+    return trajectory_of(source.vectors(episode), columns, ends, float(source.meta.fps), episode)

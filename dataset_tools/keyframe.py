@@ -1,27 +1,29 @@
 """``histmv keyframe``: from a dense LeRobot dataset to one with a row per macro step."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import MofNCompleteColumn, Progress
 
-from dataset_tools import build
+from dataset_tools import build, keyframe_shards
 from dataset_tools.columns import ColumnsConfig
-from dataset_tools.demonstrations import Demonstrations, read_demonstrations
+from dataset_tools.demonstrations import understand
 from dataset_tools.fitness import Distance
 from dataset_tools.genetic import GeneticOptions
-from dataset_tools.keyframes import MOST, KeyframeOptions, Keyframing, extract
-from dataset_tools.replay import read_scenes, replay, without_failures
+from dataset_tools.keyframe_shards import Keyframed, finished_episodes
+from dataset_tools.keyframe_worker import KeyframeJob, keyframe_missing
+from dataset_tools.keyframes import MOST, KeyframeOptions
+from dataset_tools.record_place import RECORDING_FILE
+from dataset_tools.replay import read_scenes
 from dataset_tools.report import Report
-from dataset_tools.shards import write_json
 from dataset_tools.signals import PauseOptions
 from dataset_tools.simplify import Method
-from dataset_tools.source import open_source
-from dataset_tools.trajectories import labels
-from lerobot_histmv import keys
+from dataset_tools.source import Source, open_source
+from dataset_tools.workplace import Workplace
 
 
 @dataclass
@@ -92,6 +94,8 @@ class KeyframeConfig:
     # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
     # which fail) or drop (leave those out).
     replay: Literal["off", "flag", "drop"] = "off"
+    # Processes; the result does not depend on their number.
+    workers: int = 2
     # Replace an existing output dataset.
     overwrite: bool = False
 
@@ -113,43 +117,94 @@ class KeyframeConfig:
 def run(config: KeyframeConfig) -> None:
     """Read, choose, check, write, report. Nothing appears at the output before all of it is done.
 
+    Killed and started again with the same options, it goes on with the episodes that are missing.
+
     Raises:
         ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
-            ``trajectories``, ``frames`` and ``build``.
+            ``trajectories``, ``frames`` and ``workplace``.
     """
     console = Console()
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
-    build.check_free(root, config.overwrite)
     source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
-    if root == source.root.resolve():
-        raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    demonstrations = read_demonstrations(source, config.columns)
-    with build.published(root, config.overwrite) as partial, Progress(console=console) as progress:
-        options = config.options()
-        chosen = progress.track(demonstrations.trajectories.items(), description="choosing keyframes")
-        found = {
-            number: extract(trajectory, options, number, config.keep.get(number, ())) for number, trajectory in chosen
-        }
-        failures = {} if config.replay == "off" else replay_all(demonstrations, found, progress)
-        if config.replay == "drop":
-            found = without_failures(found, failures)
-        bar = progress.add_task("writing episodes", total=len(found))
-        blank = build.write_dataset(
-            partial, demonstrations, found, config.output.repo_id, lambda: progress.advance(bar)
+    check_request(config, source, root)
+    place = Workplace(root, settings_of(config, source), config.overwrite, "keyframed")
+    place.check_free()
+    demonstrations = understand(source, config.columns)
+    scenes = read_scenes(source.root / RECORDING_FILE, source.meta.total_episodes) if config.replay != "off" else None
+    with place.opened() as parts:
+        job = KeyframeJob(parts, config.options(), demonstrations.columns, demonstrations.ends, config.keep, scenes)
+        try:
+            done = keyframe_all(source, job, config.workers, console)
+        except ValueError:  # other options or data are needed, with which this work cannot be continued
+            place.clean_up()
+            raise
+        kept = without_failures(done) if config.replay == "drop" else done
+        report = Report(
+            options=job.options,
+            source=config.dataset.repo_id,
+            columns=demonstrations.columns,
+            episodes={one.episode: one.keyframing for one in kept},
+            failures={one.episode: one.failure for one in done} if scenes else {},
+            notices=[*demonstrations.notices(), *(warning for one in kept for warning in one.warnings)],
         )
-        notices = [*demonstrations.notices(), *blank]
-        report = Report(options, config.dataset.repo_id, demonstrations.columns, found, failures, notices)
-        write_json(partial / keys.KEYFRAMING_FILE, report.as_json())
-        (partial / keys.KEYFRAMING_FILE).with_suffix(".md").write_text(report.markdown(), encoding="utf-8")
+
+        def write(path: Path) -> None:
+            keyframe_shards.write(parts, kept, demonstrations, config.output.repo_id, path)
+            report.write(path)
+
+        place.commit(write)
     report.show(console)
     console.print(f"written to {root}", highlight=False)
     if config.output.push_to_hub:
         build.push(config.output.repo_id, root, config.output.private)
 
 
-def replay_all(demonstrations: Demonstrations, found: Mapping[int, Keyframing], progress: Progress) -> dict[int, str]:
-    """By episode, why executing its key poses failed; empty for a success."""
-    source, trajectories = demonstrations.source, demonstrations.trajectories
-    scenes = read_scenes(source.root, source.meta.total_episodes)
-    actions = {number: labels(trajectories[number], one.keyframes[1:]) for number, one in found.items()}
-    return dict(progress.track(replay(scenes, actions), total=len(actions), description="replaying"))
+def check_request(config: KeyframeConfig, source: Source, root: Path) -> None:
+    """ValueError if what is asked for does not fit the dataset."""
+    if root == source.root.resolve():
+        raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
+    unknown = sorted(set(config.keep) - set(source.episodes))
+    if unknown:
+        raise ValueError(f"keep names episodes {unknown}, which are not among those to keyframe")
+    if config.workers < 1:
+        raise ValueError(f"workers is {config.workers}; it must be at least 1")
+
+
+def settings_of(config: KeyframeConfig, source: Source) -> dict[str, Any]:
+    """What decides the result, as JSON gives it back: work with other settings is not continued."""
+    options = {"columns": asdict(config.columns), **asdict(config.options()), "keep": config.keep}
+    told = {
+        "source": str(source.root.resolve()),
+        "frames": source.meta.total_frames,
+        "episodes": list(source.episodes),
+        "replay": config.replay != "off",
+        **options,
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(told))
+    return plain
+
+
+def without_failures(done: Sequence[Keyframed]) -> list[Keyframed]:
+    """The episodes whose key poses succeeded; ValueError if there is none."""
+    kept = [one for one in done if not one.failure]
+    if not kept:
+        failures = ", ".join(f"{one.episode}: {one.failure}" for one in done)
+        raise ValueError(f"no episode's key poses succeed ({failures}); a smaller --epsilon keeps more of them")
+    return kept
+
+
+def keyframe_all(source: Source, job: KeyframeJob, workers: int, console: Console) -> list[Keyframed]:
+    """Do the episodes that are not done yet; what became of each, in order.
+
+    Raises:
+        ValueError: an episode cannot be keyframed; the others' shards stay.
+        ChildProcessError: a worker process died.
+    """
+    done = finished_episodes(job.directory)
+    missing = [episode for episode in source.episodes if episode not in done]
+    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=console) as progress:
+        bar = progress.add_task("keyframing", total=len(source.episodes), completed=len(done))
+        for one in keyframe_missing(source, job, missing, workers):
+            done[one.episode] = one
+            progress.advance(bar)
+    return [done[episode] for episode in source.episodes]

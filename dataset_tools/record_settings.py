@@ -1,9 +1,7 @@
 """What decides a recorded dataset, so that a resumed recording cannot mix two."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
@@ -54,14 +52,3 @@ class RecordSettings:
     def as_json(self) -> dict[str, Any]:
         """The same as a JSON file gives it back."""
         return {**dataclasses.asdict(self), "tasks": list(self.tasks), "cameras": list(self.cameras)}
-
-    def check_same(self, found: Mapping[str, Any], where: Path, advice: str) -> None:
-        """Raise ValueError if the settings ``found`` at ``where`` are not these."""
-        mine = self.as_json()
-        changes = [
-            f"{name} was {found.get(name)!r} and is now {mine[name]!r}"
-            for name in mine
-            if found.get(name) != mine[name]
-        ]
-        if changes:
-            raise ValueError(f"{where} was recorded with other settings: {', '.join(changes)}; {advice}")

@@ -4,10 +4,6 @@ It imports neither torch nor LeRobot, which would take longer to start than it t
 """
 
 import dataclasses
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +14,8 @@ import pyarrow as pa
 
 from dataset_tools.dense_features import frame_columns
 from dataset_tools.images import encode_depth, encode_rgb, image_statistics
-from dataset_tools.shards import Outcome, write_failure, write_success
+from dataset_tools.pool import serve_parent
+from dataset_tools.shards import Outcome, as_lists, write_failure, write_success
 from lerobot_histmv import keys
 
 
@@ -122,8 +119,7 @@ def commit_episode(directory: Path, outcome: Outcome, columns: Mapping[str, np.n
     """Encode a successful episode and commit its shard; returns the outcome with the images' statistics."""
     images = {key: column for key, column in columns.items() if key.startswith(keys.IMAGES_PREFIX)}
     statistics = {key: image_statistics(column) for key, column in images.items()}
-    as_lists = {key: {name: value.tolist() for name, value in found.items()} for key, found in statistics.items()}
-    outcome = dataclasses.replace(outcome, statistics=as_lists)
+    outcome = dataclasses.replace(outcome, statistics=as_lists(statistics))
     write_success(directory, outcome, episode_table(columns))
     return outcome
 
@@ -156,19 +152,11 @@ _workers: list[Worker] = []
 
 
 def start_worker(setup: WorkerSetup) -> None:
-    """Initialise a worker process: it ignores Ctrl-C, which its parent handles, and ends when its parent does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    """Initialise a worker process."""
+    serve_parent()
     _workers[:] = [Worker(setup)]
 
 
 def make_attempt(attempt: int) -> Outcome:
     """Make an attempt in this worker process."""
     return _workers[0].make_attempt(attempt)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from rich.table import Table
 import lerobot_histmv
 from dataset_tools.columns import Columns
 from dataset_tools.keyframes import KeyframeOptions, Keyframing
+from dataset_tools.shards import write_json
 from lerobot_histmv import keys
 
 FORMAT = 1
@@ -159,6 +161,11 @@ class Report:
         table = "\n".join(f"| {' | '.join(row)} |" for row in cells)
         lines = "\n".join(f"- {line}" for line in self.summary())
         return f"# Keyframes of {self.source}\n\n{lines}\n\n{_LEGEND}\n\n{table}\n"
+
+    def write(self, root: Path) -> None:
+        """Put the report into the dataset at ``root``, as JSON and as Markdown."""
+        write_json(root / keys.KEYFRAMING_FILE, self.as_json())
+        (root / keys.KEYFRAMING_FILE).with_suffix(".md").write_text(self.markdown(), encoding="utf-8")
 
     def show(self, console: Console) -> None:
         """Print the table and the summary."""

@@ -14,12 +14,16 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-_OUTCOME = b"histmv.outcome"
+_HEADER = b"histmv.shard"
 _STEM = "attempt-{:06d}"
 _TEMPORARY = ".tmp"
+
+Statistics = dict[str, dict[str, np.ndarray]]
+"""LeRobot's statistics by column and name."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,25 @@ def shard_path(directory: Path, attempt: int) -> Path:
 
 def write_success(directory: Path, outcome: Outcome, table: pa.Table) -> None:
     """Commit an episode; the file appears whole or not at all."""
-    path = shard_path(directory, outcome.attempt)
+    write_table(shard_path(directory, outcome.attempt), table, dataclasses.asdict(outcome))
+
+
+def write_table(path: Path, table: pa.Table, header: Mapping[str, Any]) -> None:
+    """Write rows and what is to be known about them; the file appears whole or not at all."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
-    header = {_OUTCOME: json.dumps(dataclasses.asdict(outcome)).encode()}
-    pq.write_table(table.replace_schema_metadata(header), temporary, compression="none", use_dictionary=False)
+    table = table.replace_schema_metadata({_HEADER: json.dumps(header).encode()})
+    pq.write_table(table, temporary, compression="none", use_dictionary=False)
     temporary.replace(path)
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What ``write_table`` was told about the rows.
+
+    Raises:
+        pyarrow.ArrowInvalid: the file is damaged.
+    """
+    header: dict[str, Any] = json.loads(pq.read_schema(path).metadata[_HEADER])
+    return header
 
 
 def write_failure(directory: Path, outcome: Outcome) -> None:
@@ -79,10 +97,25 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     temporary.replace(path)
 
 
-def read_outcomes(directory: Path) -> dict[int, Outcome]:
-    """All finished attempts by index. Damaged shards and what killed writers left behind are deleted."""
+def delete_leftovers(directory: Path) -> None:
+    """Delete what killed writers left behind."""
     for leftover in directory.glob(f"*{_TEMPORARY}"):
         leftover.unlink()
+
+
+def as_arrays(statistics: Mapping[str, Mapping[str, Any]]) -> Statistics:
+    """Statistics as JSON gives them back, as arrays."""
+    return {key: {name: np.array(value) for name, value in found.items()} for key, found in statistics.items()}
+
+
+def as_lists(statistics: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, Any]]:
+    """Statistics in the form of JSON."""
+    return {key: {name: value.tolist() for name, value in found.items()} for key, found in statistics.items()}
+
+
+def read_outcomes(directory: Path) -> dict[int, Outcome]:
+    """All finished attempts by index. Damaged shards and what killed writers left behind are deleted."""
+    delete_leftovers(directory)
     outcomes = {}
     for path in sorted([*directory.glob("attempt-*.parquet"), *directory.glob("attempt-*.json")]):
         try:
@@ -129,4 +162,4 @@ def made_attempts(outcomes: Mapping[int, Outcome], episodes: int, tasks: int = 1
 def _read_outcome(path: Path) -> Outcome:
     if path.suffix == ".json":
         return Outcome(**json.loads(path.read_text(encoding="utf-8")))
-    return Outcome(**json.loads(pq.read_schema(path).metadata[_OUTCOME]))
+    return Outcome(**read_header(path))

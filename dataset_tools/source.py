@@ -1,7 +1,7 @@
 """Reading the episodes that are to be keyframed: any LeRobot v3 dataset, checked before anything is written."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,13 +62,14 @@ class Source:
             )
         return table
 
-    def vectors(self, episode: int) -> dict[str, Float[np.ndarray, "n _"]]:
-        """All numeric columns of action and observation of a whole episode, (frames, size) each.
+    def vectors(self, episode: int, wanted: Collection[str] | None = None) -> dict[str, Float[np.ndarray, "n _"]]:
+        """Numeric columns of action and observation of a whole episode, all or the ``wanted``, (frames, size) each.
 
         Raises:
             ValueError: a value is missing, infinite or not a number; the message names episode, frame and entry.
         """
-        names = vectors(self.features)
+        known = vectors(self.features)
+        names = known if wanted is None else {name: known[name] for name in wanted}
         table = self.table(episode, list(names))
         arrays = {}
         for name, entries in names.items():
@@ -80,20 +81,6 @@ class Source:
                 raise ValueError(f"episode {episode}, frame {frame}: {name}[{which}] is {array[frame, entry]}")
             arrays[name] = array
         return arrays
-
-    def all_vectors(self) -> dict[int, dict[str, Float[np.ndarray, "n _"]]]:
-        """``vectors`` of every episode.
-
-        Raises:
-            ValueError: also if an episode has a single frame.
-        """
-        for episode in self.episodes:
-            if self.length(episode) < 2:
-                raise ValueError(
-                    f"episode {episode} has 1 frame, but a macro step needs 2: leave it out with "
-                    "--dataset.episodes=[...], or remove it with lerobot-edit-dataset"
-                )
-        return {episode: self.vectors(episode) for episode in self.episodes}
 
     def task(self, index: int) -> str:
         """Instruction that a ``task_index`` stands for."""

@@ -26,8 +26,13 @@ def trajectory_of(vectors: Vectors, columns: Columns, ends: GripperEnds, fps: fl
     """Tool motion of one episode.
 
     Raises:
-        ValueError: a quaternion that is not unit; the message names episode and frame.
+        ValueError: a quaternion that is not unit, or a gripper outside its range; the message names episode and frame.
     """
+    gripper = None
+    if columns.gripper:
+        values = columns.gripper.of(vectors)[:, 0]
+        _check_range(values, columns, episode)
+        gripper = command(values, ends)
     commanded_position = commanded_quaternion = None
     if columns.commanded:
         position, rotation = columns.commanded
@@ -39,34 +44,24 @@ def trajectory_of(vectors: Vectors, columns: Columns, ends: GripperEnds, fps: fl
         quaternion=_quaternion(columns.rotation, columns.rotation_format, vectors, episode)
         if columns.rotation
         else None,
-        gripper=command(columns.gripper.of(vectors)[:, 0], ends) if columns.gripper else None,
+        gripper=gripper,
         commanded_position=commanded_position,
         commanded_quaternion=commanded_quaternion,
     )
 
 
-def gripper_ends(columns: Columns, episodes: Mapping[int, Vectors]) -> GripperEnds:
-    """Values that mean closed and open: those of ``columns``, else the ends of the range in the data.
-
-    Raises:
-        ValueError: a value outside the range of ``columns``; the message names episode and frame.
-    """
-    if columns.gripper is None:
-        return 0.0, 1.0
-    values = {episode: columns.gripper.of(vectors)[:, 0] for episode, vectors in episodes.items()}
+def _check_range(values: Float[np.ndarray, " n"], columns: Columns, episode: int) -> None:
+    """ValueError, naming episode and frame, if the gripper leaves the range of ``columns``."""
     if columns.gripper_range is None:
-        low, high = min(float(v.min()) for v in values.values()), max(float(v.max()) for v in values.values())
-        return (low, high) if low < high else (low - 1, high)
+        return
     low, high = sorted(columns.gripper_range)
     slack = _OUTSIDE * (high - low)
-    for episode, value in values.items():
-        outside = np.flatnonzero((value < low - slack) | (value > high + slack))
-        if len(outside):
-            raise ValueError(
-                f"episode {episode}, frame {outside[0]}: {columns.gripper} is {value[outside[0]]:g}, outside {low:g} "
-                f"to {high:g}; give --columns.gripper_range=[closed,open]"
-            )
-    return columns.gripper_range
+    outside = np.flatnonzero((values < low - slack) | (values > high + slack))
+    if len(outside):
+        raise ValueError(
+            f"episode {episode}, frame {outside[0]}: {columns.gripper} is {values[outside[0]]:g}, outside {low:g} "
+            f"to {high:g}; give --columns.gripper_range=[closed,open]"
+        )
 
 
 def command(values: Float[np.ndarray, " n"], ends: GripperEnds) -> Float[np.ndarray, " n"]:

@@ -11,9 +11,11 @@ import pytest
 from helpers.episodes import edit_column, edit_info, snapshot, vector_features, vector_frames, write, write_vector_picks
 from helpers.episodes import pick as motion_of
 
-from dataset_tools import build
+from dataset_tools import build, keyframe_worker
 from dataset_tools.columns import ColumnsConfig
 from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig, run
+from dataset_tools.keyframes import KeyframeOptions, extract
+from dataset_tools.signals import Trajectory
 from lerobot_histmv import keys
 
 LENGTH = len(motion_of(np.random.default_rng(0))["position"])
@@ -156,12 +158,44 @@ def test_an_interrupted_run_leaves_the_old_dataset_and_can_be_repeated(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(build, "_statistics", interrupt)
+        patch.setattr(build, "statistics", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(config(dense, overwrite=True))
     assert snapshot(dense.parent / "keys") == before
-    assert sorted(path.name for path in dense.parent.iterdir()) == ["dense", "keys"]
     run(config(dense, overwrite=True))
+    assert sorted(path.name for path in dense.parent.iterdir()) == ["dense", "keys"]
+
+
+def test_a_stopped_run_goes_on_with_the_missing_episodes(dense: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[int] = []
+
+    def extract_or_stop(
+        trajectory: Trajectory, options: KeyframeOptions, episode: int, asked: tuple[int, ...]
+    ) -> object:
+        if episode == 1 and not chosen[1:]:
+            chosen.append(-1)
+            raise KeyboardInterrupt
+        chosen.append(episode)
+        return extract(trajectory, options, episode, asked)
+
+    monkeypatch.setattr(keyframe_worker, "extract", extract_or_stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(config(dense))
+    with pytest.raises(ValueError, match=r"epsilon was 0\.005 and is now 0\.1"):
+        run(config(dense, epsilon=0.1))
+    run(config(dense))
+    assert chosen == [0, -1, 1]
+
+
+def test_the_number_of_processes_does_not_change_the_data(dense: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def data() -> dict[str, bytes]:
+        return {name: content for name, content in snapshot(dense.parent / "keys").items() if "keyframing" not in name}
+
+    run(config(dense, workers=1))
+    alone = data()
+    monkeypatch.setattr(keyframe_worker, "WORTH_A_PROCESS", 1)
+    run(config(dense, workers=2, overwrite=True))
+    assert data() == alone
 
 
 def test_what_a_killed_run_left_behind_is_cleared_or_put_back(tmp_path: Path) -> None:

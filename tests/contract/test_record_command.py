@@ -42,7 +42,7 @@ def test_first_successes_are_kept_and_told(uninterrupted: Path) -> None:
     assert report["success_rate"] == pytest.approx(EPISODES / report["attempts"])
     assert report["settings"]["cameras"] == list(CAMERAS)
     assert report["versions"]["lerobot"]
-    assert read_scenes(uninterrupted, EPISODES).seeds == tuple(SUCCESSES)
+    assert read_scenes(uninterrupted / RECORDING_FILE, EPISODES).seeds == tuple(SUCCESSES)
     assert sorted(path.name for path in uninterrupted.parent.iterdir()) == ["data"]
 
 

@@ -1,6 +1,7 @@
 """Replaying key poses: scenes come from the recording, the environment decides, and what fails is told."""
 
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ import pytest
 
 import lerobot_histmv.envs
 from dataset_tools.columns import Column, Columns
+from dataset_tools.keyframe import without_failures
+from dataset_tools.keyframe_shards import Keyframed
 from dataset_tools.keyframes import KeyframeOptions, extract
-from dataset_tools.replay import Scenes, read_scenes, replay, without_failures
+from dataset_tools.replay import Replayer, Scenes, read_scenes
 from dataset_tools.report import Report
 from dataset_tools.signals import Trajectory
 from lerobot_histmv.envs.disturbances import Disturbances
@@ -53,29 +56,30 @@ def rows(*x: float) -> np.ndarray:
 
 def test_each_episode_is_replayed_in_its_own_scene_until_it_succeeds_or_ends(env: FakeEnv) -> None:
     actions = {0: rows(5, 11, 99), 2: rows(1, 2, 3, 17), 1: rows(5)}
-    assert list(replay(SCENES, actions)) == [(0, ""), (2, "wrong object"), (1, "not finished")]
+    with closing(Replayer(SCENES)) as replayer:
+        failures = {episode: replayer.failure(episode, action) for episode, action in actions.items()}
+    assert failures == {0: "", 2: "wrong object", 1: "not finished"}
     assert env.resets == [(11, 2), (17, 5), (13, 3)]
     assert env.closed
 
 
 def test_actions_that_are_no_tool_poses_are_refused(env: FakeEnv) -> None:
     with pytest.raises(ValueError, match=r"replay needs actions of ee\.x\.pos.*these have 4"):
-        list(replay(SCENES, {0: np.zeros((2, 4), np.float32)}))
-    assert env.closed
+        Replayer(SCENES).failure(0, np.zeros((2, 4), np.float32))
 
 
 def test_scenes_are_read_from_the_recording(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="other data have no scene"):
-        read_scenes(tmp_path, 3)
+        read_scenes(tmp_path / "recording.json", 3)
     told = {
         "settings": {"disturbances": {"distractors": 2}}, "tasks": list(SCENES.tasks),
         "seeds": [11, 13, 17], "variations": [2, 3, 5],
     }  # fmt: skip
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta/recording.json").write_text(json.dumps(told))
-    assert read_scenes(tmp_path, 3) == replace(SCENES, disturbances=Disturbances(distractors=2))
+    path = tmp_path / "recording.json"
+    path.write_text(json.dumps(told))
+    assert read_scenes(path, 3) == read_scenes(path) == replace(SCENES, disturbances=Disturbances(distractors=2))
     with pytest.raises(ValueError, match="tells 3 of 2"):
-        read_scenes(tmp_path, 2)
+        read_scenes(path, 2)
 
 
 def test_what_fails_in_replay_is_told_with_what_became_of_it() -> None:
@@ -88,6 +92,7 @@ def test_what_fails_in_replay_is_told_with_what_became_of_it() -> None:
     assert "episode 1: its key poses fail in replay (grasp missed); left out" in told
     assert "episode 2: its key poses fail in replay (time); kept" in told
     assert report.as_json()["replay"] == {"0": "", "1": "grasp missed", "2": "time"}
-    assert without_failures({0: one, 1: one}, {0: "", 1: "time"}) == {0: one}
+    done = [Keyframed(number, one, failure, (), {}, ()) for number, failure in ((0, ""), (1, "time"))]
+    assert without_failures(done) == done[:1]
     with pytest.raises(ValueError, match="no episode's key poses succeed"):
-        without_failures({1: one}, {1: "time"})
+        without_failures(done[1:])

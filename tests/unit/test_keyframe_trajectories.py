@@ -1,12 +1,16 @@
 """Trajectories and labels out of columns: one quaternion order, one meaning of the gripper, checked numbers."""
 
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from dataset_tools.columns import Column, Columns
+from dataset_tools.demonstrations import gripper_ends
 from dataset_tools.signals import Keyframe, Trajectory
-from dataset_tools.trajectories import command, gripper_ends, label_names, labels, trajectory_of
+from dataset_tools.source import Source
+from dataset_tools.trajectories import command, label_names, labels, trajectory_of
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import canonical
 
@@ -51,18 +55,31 @@ def test_the_gripper_becomes_one_or_zero_whatever_its_range_and_small_wobbles_do
     assert command(1 - 2 * opening, (1.0, -1.0)).tolist() == expected
 
 
+class Recorded(Source):
+    """A dataset that has nothing but gripper commands by episode."""
+
+    commands: dict[int, list[float]]
+
+    def __init__(self, commands: dict[int, list[float]]) -> None:
+        object.__setattr__(self, "commands", commands)
+        object.__setattr__(self, "episodes", tuple(commands))
+
+    def vectors(self, episode: int, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
+        assert wanted == ["action"]
+        return {"action": np.array(self.commands[episode], dtype=np.float64)[:, None]}
+
+
 def test_the_range_of_an_unknown_gripper_is_that_of_all_episodes() -> None:
-    episodes = {0: {"action": np.array([[3.0], [5.0]])}, 4: {"action": np.array([[4.0], [9.0]])}}
-    assert gripper_ends(columns(), episodes) == (3.0, 9.0)
-    still = {0: {"action": np.full((5, 1), 3.0)}}
-    assert command(np.full(5, 3.0), gripper_ends(columns(), still)).tolist() == [1, 1, 1, 1, 1]
+    assert gripper_ends(Recorded({0: [3, 5], 4: [4, 9]}), columns()) == (3, 9)
+    assert gripper_ends(Recorded({0: [3, 5]}), columns(gripper_range=(100.0, 0.0))) == (100.0, 0.0)
+    still = gripper_ends(Recorded({0: [3, 3]}), columns())
+    assert command(np.full(5, 3.0), still).tolist() == [1, 1, 1, 1, 1]
 
 
 def test_a_gripper_outside_its_range_is_named_with_episode_and_frame() -> None:
-    episodes = {0: {"action": np.ones((2, 1))}, 4: {"action": np.array([[1.0], [57.0]])}}
+    vectors = {"state": np.zeros((2, 3)), "action": np.array([[1.0], [57.0]])}
     with pytest.raises(ValueError, match=r"episode 4, frame 1: action:0 is 57, outside 0 to 1"):
-        gripper_ends(columns(gripper_range=(0.0, 1.0)), episodes)
-    assert gripper_ends(columns(gripper_range=(100.0, 0.0)), episodes) == (100.0, 0.0)
+        trajectory_of(vectors, columns(gripper_range=(0.0, 1.0)), (0.0, 1.0), 20.0, 4)
 
 
 def test_labels_are_the_pose_at_the_pose_frame_and_the_command_in_force_after_it() -> None:

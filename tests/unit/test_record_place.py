@@ -76,6 +76,14 @@ def test_overwriting_keeps_the_old_dataset_until_the_new_one_is_whole(tmp_path: 
     assert place(tmp_path / "data").finished(11)
 
 
+def test_a_kill_between_the_renames_of_a_commit_loses_nothing(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data.parts" / "replaced")
+    (tmp_path / "data.parts" / "settings.json").write_text(json.dumps(SETTINGS.as_json()))
+    with pytest.raises(ValueError, match="holds a dataset"), place(tmp_path / "data").opened():
+        pass
+    assert place(tmp_path / "data").finished(5)
+
+
 def test_a_started_recording_is_only_continued_with_its_settings(tmp_path: Path) -> None:
     with place(tmp_path / "data").opened() as parts:
         (parts / "attempt-000000.json").write_text("{}")
@@ -94,6 +102,9 @@ def test_a_working_directory_is_never_shared_nor_taken_from_others(tmp_path: Pat
         pass
     (tmp_path / "other.parts").mkdir()
     (tmp_path / "other.parts" / "thesis.tex").touch()
-    with pytest.raises(ValueError, match="not made by a recording"), place(tmp_path / "other", overwrite=True).opened():
+    with (
+        pytest.raises(ValueError, match="holds no unfinished work"),
+        place(tmp_path / "other", overwrite=True).opened(),
+    ):
         pass
     assert [path.name for path in (tmp_path / "other.parts").iterdir()] == ["thesis.tex"]
