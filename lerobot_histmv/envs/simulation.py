@@ -62,14 +62,17 @@ class Simulation:
 
     def reset(self) -> None:
         """Arm at home, gripper open, objects where the model has them, everything at rest."""
-        self.model.opt.enableflags = 0
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._qpos] = self.home
         self.data.ctrl[:6] = self.home
         self.refresh()
 
     def refresh(self) -> None:
-        """Bring body, site and camera poses up to date with the joint positions; the dynamics do not notice."""
+        """Bring body, site and camera poses up to date with what was placed; the dynamics do not notice."""
+        self.model.opt.enableflags = 0
+        self._update_poses()
+
+    def _update_poses(self) -> None:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -83,7 +86,7 @@ class Simulation:
             share = (step + REFERENCE_STEPS) / self._steps
             self.data.ctrl[:6] = start + share * (end - start) + lead
             mujoco.mj_step(self.model, self.data, REFERENCE_STEPS)
-        self.refresh()
+        self._update_poses()
         for callback in self.after_tick:
             callback()
 
