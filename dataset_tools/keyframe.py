@@ -8,12 +8,13 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import Progress
 
-from dataset_tools import build
+from dataset_tools import build, hub
 from dataset_tools.columns import ColumnsConfig
 from dataset_tools.demonstrations import Demonstrations, read_demonstrations
 from dataset_tools.fitness import Distance
 from dataset_tools.genetic import GeneticOptions
 from dataset_tools.keyframes import MOST, KeyframeOptions, Keyframing, extract
+from dataset_tools.push import push_dataset
 from dataset_tools.replay import read_scenes, replay, without_failures
 from dataset_tools.report import Report
 from dataset_tools.shards import write_json
@@ -46,10 +47,12 @@ class OutputConfig:
     repo_id: str
     # Folder to write; by default LeRobot's own place for this repo_id.
     root: Path | None = None
-    # Upload it when done.
+    # Upload it when done, with a card that tells how it was made; histmv push does the same later.
     push_to_hub: bool = False
     # Upload it as a private repository.
     private: bool = False
+    # Licence in the card, as the Hub names it; by default apache-2.0. The licence of the source may ask for another.
+    license: str | None = None
 
 
 @dataclass
@@ -110,11 +113,13 @@ def run(config: KeyframeConfig) -> None:
 
     Raises:
         ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
-            ``trajectories``, ``frames`` and ``build``.
+            ``trajectories``, ``frames``, ``build`` and ``hub``.
     """
     console = Console()
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
     build.check_free(root, config.overwrite)
+    if config.output.push_to_hub:
+        hub.prepare(config.output.repo_id, config.output.private)
     source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
@@ -137,7 +142,7 @@ def run(config: KeyframeConfig) -> None:
     report.show(console)
     console.print(f"written to {root}", highlight=False)
     if config.output.push_to_hub:
-        build.push(config.output.repo_id, root, config.output.private)
+        push_dataset(root, config.output.repo_id, config.output.private, config.output.license)
 
 
 def replay_all(demonstrations: Demonstrations, found: Mapping[int, Keyframing], progress: Progress) -> dict[int, str]:

@@ -1,4 +1,4 @@
-"""What a Hub keeps: repositories with branches, tags, atomic commits, and large files that arrive before their commit."""
+"""What a Hub keeps: repositories with branches, tags and atomic commits, and large files from before their commit."""
 
 import base64
 import hashlib
