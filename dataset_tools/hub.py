@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import httpx
-from huggingface_hub import HfApi, constants
+from huggingface_hub import HfApi, constants, get_token
 from huggingface_hub.errors import (
     GatedRepoError,
     HfHubHTTPError,
@@ -21,7 +21,6 @@ from huggingface_hub.errors import (
     RepositoryNotFoundError,
     RevisionNotFoundError,
 )
-from huggingface_hub.utils import get_token
 
 Kind = Literal["dataset", "model"]
 REPLACED = ["data/*", "meta/*", "videos/*"]
@@ -88,6 +87,8 @@ def prepare(repo_id: str, private: bool, kind: Kind = "dataset") -> str:
     Raises:
         ValueError: the Hub refuses, or the repository is there and public though ``private`` is asked for.
     """
+    if repo_id.count("/") != 1:
+        raise ValueError(f"repo_id is {repo_id!r}; on the Hub it is user/name")
     api = HfApi()
     with explained(repo_id):
         api.whoami()

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -48,7 +47,6 @@ def run(config: PushConfig) -> None:
     Raises:
         ValueError: the folder holds neither dataset nor checkpoint, or one that is not whole; or the Hub refuses.
     """
-    validate_repo_id(config.repo_id)
     root = (config.root or default_root(config.repo_id)).expanduser().resolve()
     if (root / "meta/info.json").is_file():
         push_dataset(root, config.repo_id, config.private, config.license)
