@@ -26,7 +26,7 @@ def dataset_card(root: Path, meta: LeRobotDatasetMetadata, license: str | None) 
         license: the Hub's name of a licence; by default that of ``README.md``, else ``LICENSE``.
     """
     tags = ["histmv", *_kinds(root, meta)]
-    made = create_lerobot_dataset_card(tags=tags, dataset_info=meta.info, license=LICENSE)
+    made = create_lerobot_dataset_card(tags=tags, license=LICENSE)
     card = DatasetCard(_document(made, "\n\n".join(sections(root, meta))))
     return refreshed(card, root / CARD_FILE, license)
 

@@ -4,7 +4,6 @@ import json
 import shlex
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import draccus
 import pytest
@@ -16,9 +15,9 @@ from tiny_policy import TASK, tiny_config, tiny_policy
 
 from dataset_tools import card, cli
 from dataset_tools.card_commands import record_command
-from dataset_tools.keyframe import KeyframeConfig
 from dataset_tools.record import RecordConfig, checked_settings
 from dataset_tools.record_report import recording_report
+from dataset_tools.shards import Outcome
 from lerobot_histmv import keys
 
 KEYFRAMING = ["--method=exact", "--epsilon=0.003", "--pause.dwell=0.13", "--columns.commanded=false"]
@@ -41,7 +40,7 @@ def written(root: Path, license: str | None = None) -> DatasetCard:
 def command_in(text: str, name: str) -> list[str]:
     """Words of the command under "Made with"."""
     _, _, made = text.partition("## Made with")
-    words = shlex.split(made.split("```")[1].removeprefix("bash"))
+    words = shlex.split(made.split("```")[1].removeprefix("bash").replace("\\\n", " "))
     assert words[:2] == ["histmv", name]
     return words[2:]
 
@@ -69,7 +68,6 @@ def test_keyframed_card_states_method_errors_calibration_and_source(keyed: Path)
 
 def test_the_cards_command_makes_the_same_data_again(keyed: Path, tmp_path: Path) -> None:
     words = command_in(written(keyed).text, "keyframe")
-    draccus.parse(KeyframeConfig, args=words)
     cli.main(["keyframe", *words, f"--dataset.root={keyed.parent / 'dense'}", f"--output.root={tmp_path / 'again'}"])
     again, first = snapshot(tmp_path / "again"), snapshot(keyed)
     assert [name for name in first if name.startswith("data/")]
@@ -91,8 +89,9 @@ def test_recordings_card_tells_the_success_and_its_command_has_the_same_settings
 )
 def test_record_command_has_the_settings_of_the_recording(options: list[str]) -> None:
     settings = checked_settings(draccus.parse(RecordConfig, args=[*options, "--env.cameras=[wrist,front]"]))
-    kept: Any = SimpleNamespace(success=True, rows=1, task="", seed=0, variation=0)
-    words = shlex.split(record_command(recording_report(settings, [kept] * 3 * len(settings.tasks)), "ann/dense"))[2:]
+    kept = Outcome(0, 0, "", 0, "", [], "", 1)
+    command = record_command(recording_report(settings, [kept] * 3 * len(settings.tasks)), "ann/dense")
+    words = shlex.split(command.replace("\\\n", " "))[2:]
     again = draccus.parse(RecordConfig, args=words)
     assert checked_settings(again) == settings
     assert again.episodes == 3

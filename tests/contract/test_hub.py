@@ -107,7 +107,7 @@ def test_broken_upload_shows_nothing_and_is_continued(hub: Hub, ann: Client, tmp
         "keyframe", "--dataset.repo_id=ann/breaks", f"--output.root={tmp_path}/k", "--output.repo_id=a/b"
     )
     assert "its upload is not finished" in unfinished
-    arrived = set(hub.begun[before:]) & set(hub.stored)
+    arrived = set(hub.begun[before:]) & set(repo.stored)
     assert len(arrived) == 1
     hub.fault, repeated = None, len(hub.begun)
     ann.histmv(*push)

@@ -111,7 +111,7 @@ def preupload(request: "Request", kind: str, name: str, revision: str) -> Answer
 
 def large_files(request: "Request", kind: str, name: str) -> Answer:
     """LFS's batch: where to upload what is not stored yet."""
-    request.writable(kind, name)
+    stored = request.writable(kind, name).stored
     objects = []
     for wanted in request.json["objects"]:
         path = f"lfs/{kind}/{name}/{wanted['oid']}"
@@ -119,29 +119,28 @@ def large_files(request: "Request", kind: str, name: str) -> Answer:
             "upload": {"href": f"{request.hub.storage}/{path}"},
             "verify": {"href": f"{request.hub.url}/{path}/verify"},
         }
-        objects.append(wanted | ({} if wanted["oid"] in request.hub.stored else {"actions": actions}))
+        objects.append(wanted | ({} if wanted["oid"] in stored else {"actions": actions}))
     return as_json({"transfer": "basic", "objects": objects})
 
 
-def upload(request: "Request", oid: str, **_: str) -> Answer:
+def upload(request: "Request", kind: str, name: str, oid: str) -> Answer:
     """Storage: its addresses are signed, so that it asks for no token."""
     tokenless(request)
     if hashlib.sha256(request.body).hexdigest() != oid:
         raise HubError(400, "the content does not match its SHA-256")
-    request.hub.stored[oid] = request.body
+    request.hub.repo(kind, name).stored[oid] = request.body
     return Answer()
 
 
 def verify(request: "Request", kind: str, name: str, oid: str) -> Answer:
-    request.writable(kind, name)
-    if len(request.hub.stored.get(oid, b"")) != request.json["size"]:
+    if len(request.writable(kind, name).stored.get(oid, b"")) != request.json["size"]:
         raise HubError(422, f"{oid} is not stored")
     return as_json({})
 
 
 def commit(request: "Request", kind: str, name: str, revision: str) -> Answer:
     lines = [json.loads(line) for line in request.body.splitlines()]
-    oid = request.writable(kind, name).commit(revision, lines, request.hub.stored)
+    oid = request.writable(kind, name).commit(revision, lines)
     prefix = "" if kind == "model" else f"{kind}s/"
     url = f"{request.hub.url}/{prefix}{name}/commit/{oid}"
     return as_json({"success": True, "commitOid": oid, "commitUrl": url, "hookOutput": ""})
@@ -157,7 +156,9 @@ def resolve(request: "Request", name: str, revision: str, path: str, prefix: str
     if not file.large:
         return part(request, file.content, head | {"ETag": f'"{file.blob}"'})
     large = {"X-Linked-Size": str(len(file.content)), "X-Linked-ETag": f'"{file.sha256}"'}
-    return Answer(302, b"", head | large | {"Location": f"{request.hub.storage}/storage/{file.sha256}"})
+    return Answer(
+        302, b"", head | large | {"Location": f"{request.hub.storage}/storage/{repo.kind}/{name}/{file.sha256}"}
+    )
 
 
 def tokenless(request: "Request") -> None:
@@ -166,9 +167,9 @@ def tokenless(request: "Request") -> None:
         raise HubError(400, "only one way of authentication is allowed")
 
 
-def storage(request: "Request", oid: str) -> Answer:
+def storage(request: "Request", kind: str, name: str, oid: str) -> Answer:
     tokenless(request)
-    return part(request, request.hub.stored[oid], {"ETag": f'"{oid}"'})
+    return part(request, request.hub.repo(kind, name).stored[oid], {"ETag": f'"{oid}"'})
 
 
 def part(request: "Request", content: bytes, headers: dict[str, str]) -> Answer:
@@ -199,7 +200,7 @@ ROUTES: list[tuple[str, str, Callable[..., Answer]]] = [
     ("POST", rf"{_API}/commit/{_REVISION}", commit),
     ("PUT", rf"/lfs/(?P<kind>\w+)/{_NAME}/(?P<oid>\w+)", upload),
     ("POST", rf"/lfs/(?P<kind>\w+)/{_NAME}/(?P<oid>\w+)/verify", verify),
-    ("GET HEAD", r"/storage/(?P<oid>\w+)", storage),
+    ("GET HEAD", rf"/storage/(?P<kind>\w+)/{_NAME}/(?P<oid>\w+)", storage),
     ("GET HEAD", rf"/(?P<prefix>datasets/)?{_NAME}/resolve/{_REVISION}/(?P<path>.+)", resolve),
     ("POST", rf"/{_NAME}\.git/info/lfs/objects/batch", lambda request, name: large_files(request, "model", name)),
     (

@@ -35,7 +35,6 @@ class Hub:
 
     def __init__(self, users: dict[str, str]) -> None:
         self.users, self.repos = users, dict[tuple[str, str], Repo]()
-        self.stored: dict[str, bytes] = {}
         self.begun: list[str] = []
         """SHA-256 of every large file whose upload was begun, in order."""
         self.fault: Fault | None = None

@@ -54,6 +54,8 @@ class Repo:
     commits: dict[str, Tree] = field(default_factory=dict)
     branches: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
+    stored: dict[str, bytes] = field(default_factory=dict)
+    """Large files by SHA-256, whether a commit names them or not."""
 
     def __post_init__(self) -> None:
         attributes = "".join(f"*{suffix} filter=lfs diff=lfs merge=lfs -text\n" for suffix in LARGE)
@@ -84,23 +86,17 @@ class Repo:
     def upload_mode(self, path: str, size: int) -> str:
         return "lfs" if PurePosixPath(path).suffix in LARGE or size > REGULAR_LIMIT else "regular"
 
-    def commit(self, branch: str, lines: Iterable[Mapping], stored: Mapping[str, bytes]) -> str:
-        """Apply a commit's operations, all or none.
-
-        Args:
-            branch: to commit to.
-            lines: header and operations as the client sends them.
-            stored: large files that arrived before, by their SHA-256.
-        """
+    def commit(self, branch: str, lines: Iterable[Mapping]) -> str:
+        """Apply a commit's operations, header first, as the client sends them: all or none."""
         tree = dict(self.tree(branch))
         for line in lines:
             value = line["value"]
             if line["key"] == "file":
                 tree[value["path"]] = File(base64.b64decode(value["content"]), False)
             elif line["key"] == "lfsFile":
-                if value["oid"] not in stored:
+                if value["oid"] not in self.stored:
                     raise HubError(400, f"LFS pointer pointed to a file that does not exist: {value['path']}")
-                tree[value["path"]] = File(stored[value["oid"]], True)
+                tree[value["path"]] = File(self.stored[value["oid"]], True)
             elif line["key"] == "deletedFile":
                 if tree.pop(value["path"], None) is None:
                     raise HubError(404, "A file with this name doesn't exist", "EntryNotFound")
