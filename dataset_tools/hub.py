@@ -53,8 +53,7 @@ def _sentence(error: BaseException, repo_id: str) -> str | None:
             case LocalTokenNotFoundError():
                 return f"there is no access token for {repo_id} on {hub}: {LOGIN}"
             case RepositoryNotFoundError() | GatedRepoError():
-                who = "the token's user may not see it" if get_token() else "there is no access token"
-                return f"{hub} shows no {repo_id}: it does not exist, or it is private and {who}; {LOGIN}"
+                return _hidden(repo_id)
             case RevisionNotFoundError():
                 return f"{repo_id} on {hub} has no such revision: {cause.response.url.path}"
             case HfHubHTTPError(response=httpx.Response() as response):
@@ -72,7 +71,14 @@ def _sentence(error: BaseException, repo_id: str) -> str | None:
     return None
 
 
+def _hidden(repo_id: str) -> str:
+    who = "the token's user may not see it" if get_token() else "there is no access token"
+    return f"{constants.ENDPOINT} shows no {repo_id}: it does not exist, or it is private and {who}; {LOGIN}"
+
+
 def _refusal(response: httpx.Response, repo_id: str) -> str:
+    if response.status_code == 401 and get_token() is None:
+        return _hidden(repo_id)  # the client tells this from other refusals on some of the Hub's pages only
     reason = response.headers.get("X-Error-Message") or response.reason_phrase
     if response.status_code in (401, 403):
         return f"{constants.ENDPOINT} refuses {repo_id} ({reason}): {LOGIN}, with a token that may write to it"

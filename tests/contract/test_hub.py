@@ -1,5 +1,7 @@
 """What is pushed comes back byte by byte; a broken upload changes nothing for readers; refusals are one sentence."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 from fake_ur5 import write_checkpoint
 from helpers.episodes import pick, snapshot, write_picks, write_vector_picks
-from helpers.hub_client import Client
+from helpers.hub_client import Client, environment
 from helpers.hub_server import Fault, Hub, serve
 from helpers.hub_store import File, Repo
 
@@ -176,10 +178,18 @@ def test_offline_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert "ann/far is not on this machine, and HF_HUB_OFFLINE is set" in capsys.readouterr().err
 
 
-def test_wrong_address_is_told(tmp_path: Path, dense: Path) -> None:
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [("/elsewhere", "404 Not Found); is HF_ENDPOINT right?"), ("", "check the network and HF_ENDPOINT")],
+)
+def test_wrong_address_is_told(hub: Hub, tmp_path: Path, path: str, message: str) -> None:
     with serve() as gone:
-        url = gone.url
-    with Client(url, tmp_path, "token-of-ann") as client:
-        said = client.fails("push", f"--root={dense}", "--repo_id=ann/dense")
-    assert f"no connection to {url} for ann/dense" in said
-    assert "check the network and HF_ENDPOINT" in said
+        url = f"{hub.url}{path}" if path else gone.url
+    command = [sys.executable, "-c", "from dataset_tools import hub; hub.prepare('ann/dense', private=False)"]
+    variables = environment(url, tmp_path, "token-of-ann")
+    result = subprocess.run(command, env=variables, capture_output=True, text=True)
+    said = result.stderr.splitlines()[-1]
+    assert said.startswith("ValueError: ")
+    assert url in said
+    assert "ann/dense" in said
+    assert message in said
