@@ -35,7 +35,9 @@ def sections(root: Path, meta: LeRobotDatasetMetadata) -> list[str]:
     if keyframing:
         found.append(_keyframing(keyframing))
     if keys.INTRINSICS in meta.features and keys.EXTRINSICS in meta.features:
-        found += [_calibration(meta), CONVENTIONS]
+        found.append(_calibration(meta))
+        # Data of other origin may be calibrated and still order its quaternions otherwise.
+        found += [CONVENTIONS] if tuple(meta.features[keys.ACTION]["names"] or ())[:8] == keys.POSE_NAMES else []
     found.append(_instructions(root, meta))
     return [*found, _use(meta, bool(keyframing)), *_commands(meta, recording, keyframing)]
 
