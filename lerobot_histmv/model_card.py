@@ -20,7 +20,7 @@ INSTRUCTIONS = 10
 CONVENTIONS = """* World = robot base, metres, z up. Camera frame: x right, y down, z forward. Pixel (u, v)
   has its centre at (u, v).
 * Calibration comes with every observation: `observation.camera_intrinsics` (fx, fy, cx, cy [pixels] of every camera)
-  and `observation.camera_extrinsics` (rows of the 3 x 4 matrix from camera to world), in the order of the cameras above.
+  and `observation.camera_extrinsics` (rows of the 3 x 4 matrix from camera to world), in the cameras' order above.
 * Depth in millimetres along the optical axis, 0 = invalid.
 * An action is the next key pose: tool position [m], quaternion w, x, y, z, gripper (1 open, 0 closed). The arm moves to
   it with the gripper as it is, then the gripper is driven, then the next observation is taken."""
