@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32
-from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -174,8 +173,3 @@ def check_free(root: Path, overwrite: bool) -> None:
 def default_root(repo_id: str) -> Path:
     """Where LeRobot keeps a local dataset of this name."""
     return Path(HF_LEROBOT_HOME) / repo_id
-
-
-def push(repo_id: str, root: Path, private: bool) -> None:
-    """Upload a dataset to the Hub, with a card and the version tag that LeRobot asks for."""
-    LeRobotDataset(repo_id, root=root).push_to_hub(private=private or None, tags=["histmv", "keyframes"])

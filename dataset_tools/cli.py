@@ -33,6 +33,7 @@ COMMANDS = {
     ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
+    "push": Command("dataset_tools.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),
     "report": Command("dataset_tools.demo_report", "the one-page report of a demo directory, written again"),

@@ -12,6 +12,7 @@ from typing import Any
 import draccus
 import numpy as np
 import torch
+from huggingface_hub import snapshot_download
 from jaxtyping import Float
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.envs import make_env_pre_post_processors, preprocess_observation
@@ -22,6 +23,7 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from dataset_tools import hub
 from lerobot_histmv import _plugin  # noqa: F401  (registers the policy, its processors and the environments)
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
@@ -45,7 +47,7 @@ def checkpoint_folder(path: str) -> Path:
     """Local folder of the checkpoint ``path``; a model on the Hub is downloaded.
 
     Raises:
-        ValueError: there is no checkpoint.
+        ValueError: there is no checkpoint, here or on the Hub.
     """
     local = Path(path).expanduser()
     if not path:
@@ -58,13 +60,8 @@ def checkpoint_folder(path: str) -> Path:
         raise ValueError(f"{path} is no checkpoint: it lacks {CONFIG} or {WEIGHTS}{hint}")
     if path.count("/") != 1 or path.startswith((".", "/", "~")):
         raise ValueError(f"there is no folder {path}; a checkpoint is a folder with {CONFIG} and {WEIGHTS}")
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
-
-    try:
+    with hub.explained(path):
         return Path(snapshot_download(path))
-    except (HfHubHTTPError, LocalEntryNotFoundError, OSError) as error:
-        raise ValueError(f"{path} is neither a folder nor a model that the Hub gives ({error})") from error
 
 
 def load_config(source: PolicySource) -> PreTrainedConfig:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
-from dataset_tools import build, keyframe_shards
+from dataset_tools import build, hub, keyframe_shards
 from dataset_tools.columns import ColumnsConfig
 from dataset_tools.demonstrations import understand
 from dataset_tools.fitness import Distance
@@ -17,6 +17,7 @@ from dataset_tools.genetic import GeneticOptions
 from dataset_tools.keyframe_shards import Keyframed, finished_episodes
 from dataset_tools.keyframe_worker import KeyframeJob, keyframe_missing
 from dataset_tools.keyframes import MOST, KeyframeOptions
+from dataset_tools.push import push_dataset
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.replay import read_scenes
 from dataset_tools.report import Report
@@ -48,10 +49,12 @@ class OutputConfig:
     repo_id: str
     # Folder to write; by default LeRobot's own place for this repo_id.
     root: Path | None = None
-    # Upload it when done.
+    # Upload it when done, with a card that tells how it was made; histmv push does the same later.
     push_to_hub: bool = False
     # Upload it as a private repository.
     private: bool = False
+    # Licence in the card, as the Hub names it; by default apache-2.0. The licence of the source may ask for another.
+    license: str | None = None
 
 
 @dataclass
@@ -121,7 +124,7 @@ def run(config: KeyframeConfig) -> None:
 
     Raises:
         ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
-            ``trajectories``, ``frames`` and ``workplace``.
+            ``trajectories``, ``frames``, ``workplace`` and ``hub``.
     """
     console = Console()
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
@@ -129,6 +132,8 @@ def run(config: KeyframeConfig) -> None:
     check_request(config, source, root)
     place = Workplace(root, settings_of(config, source), config.overwrite, "keyframed")
     place.check_free()
+    if config.output.push_to_hub:
+        hub.prepare(config.output.repo_id, config.output.private)
     demonstrations = understand(source, config.columns)
     scenes = read_scenes(source.root / RECORDING_FILE, source.meta.total_episodes) if config.replay != "off" else None
     with place.opened() as parts:
@@ -156,7 +161,7 @@ def run(config: KeyframeConfig) -> None:
     report.show(console)
     console.print(f"written to {root}", highlight=False)
     if config.output.push_to_hub:
-        build.push(config.output.repo_id, root, config.output.private)
+        push_dataset(root, config.output.repo_id, config.output.private, config.output.license)
 
 
 def check_request(config: KeyframeConfig, source: Source, root: Path) -> None:

@@ -61,6 +61,12 @@ class RecordConfig:
     workers: int = 2
     # Scene seed of the first attempt; attempt i uses seed + i, all below 100000.
     seed: int = 0
+    # Upload the dataset when done, with a card that tells how it was made; histmv push does the same later.
+    push_to_hub: bool = False
+    # Upload it as a private repository.
+    private: bool = False
+    # Licence in the card, as the Hub names it; by default apache-2.0.
+    license: str | None = None
     # Replace a dataset, or a started recording with other settings, that is in the way.
     overwrite: bool = False
 
@@ -69,7 +75,7 @@ def run(config: RecordConfig) -> None:
     """Record as ``config`` says, or go on where a killed recording of the same settings stopped.
 
     Raises:
-        ValueError: a setting is impossible, or something in the way must not be overwritten.
+        ValueError: a setting is impossible, something in the way must not be overwritten, or the Hub refuses.
     """
     settings = checked_settings(config)
     repo_id = config.repo_id or f"local/ur5_{config.env.task.split(',')[0].strip()}"
@@ -85,7 +91,15 @@ def run(config: RecordConfig) -> None:
     make_env = partial(make, **options)
     root = Path(config.root).expanduser().resolve() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
+    if config.push_to_hub:
+        from dataset_tools import hub  # here and below, because these imports take seconds
+
+        hub.prepare(repo_id, config.private)
     recorder.record(config.episodes_per_variation or config.episodes, config.workers)
+    if config.push_to_hub:
+        from dataset_tools.push import push_dataset
+
+        push_dataset(root, repo_id, config.private, config.license)
 
 
 def checked_settings(config: RecordConfig) -> RecordSettings:

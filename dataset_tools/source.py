@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
+from dataset_tools import hub
 from dataset_tools.columns import vectors
 from lerobot_histmv import keys
 
@@ -93,12 +94,13 @@ def open_source(
     """Dataset to keyframe; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
 
     Raises:
-        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, or a dataset that
-            is keyframed already.
+        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, a dataset that is
+            keyframed already, or one that the Hub does not give.
     """
     if root is not None:
-        _check_files(Path(root))
-    meta = LeRobotDatasetMetadata(repo_id, root, revision)
+        check_files(Path(root))
+    with hub.explained(repo_id):
+        meta = LeRobotDatasetMetadata(repo_id, root, revision)
     if keys.SOURCE_FRAME in meta.features:
         raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
     chosen = tuple(range(meta.total_episodes)) if episodes is None else tuple(episodes)
@@ -107,23 +109,25 @@ def open_source(
         raise ValueError(
             f"episodes {unknown} do not exist; {repo_id} has {meta.total_episodes} of them, counted from 0"
         )
-    missing = _missing_files(meta, chosen)
+    missing = missing_files(meta, chosen)
     if missing and root is None:
-        meta = LeRobotDataset(repo_id, episodes=list(chosen), revision=revision).meta
-        missing = _missing_files(meta, chosen)
+        with hub.explained(repo_id):
+            meta = LeRobotDataset(repo_id, episodes=list(chosen), revision=revision).meta
+        missing = missing_files(meta, chosen)
     if missing:
         raise ValueError(f"{meta.root} lacks {', '.join(map(str, missing))}; copy the dataset again")
-    _check_files(Path(meta.root))
+    check_files(Path(meta.root))
     return Source(meta, Path(meta.root), chosen)
 
 
-def _missing_files(meta: LeRobotDatasetMetadata, episodes: Sequence[int]) -> list[Path]:
+def missing_files(meta: LeRobotDatasetMetadata, episodes: Sequence[int]) -> list[Path]:
+    """Data and video files of ``episodes`` that are not there, relative to the dataset's folder."""
     wanted = {meta.get_data_file_path(episode) for episode in episodes}
     wanted |= {meta.get_video_file_path(episode, key) for key in meta.video_keys for episode in episodes}
     return sorted(path for path in wanted if not (meta.root / path).is_file())
 
 
-def _check_files(root: Path) -> None:
+def check_files(root: Path) -> None:
     """ValueError unless ``root`` holds LeRobot metadata and parquet files that are whole."""
     if not (root / "meta/info.json").is_file():
         raise ValueError(

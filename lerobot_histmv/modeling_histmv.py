@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from einops import rearrange, repeat
+from huggingface_hub import ModelCard
 from jaxtyping import Float, Int
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
@@ -18,6 +19,7 @@ from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
 from lerobot_histmv.model.view_attention import best_shares, choice_loss, ranking_loss
+from lerobot_histmv.model_card import model_card
 from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
 
 Batch = dict[str, Any]
@@ -71,6 +73,18 @@ class HistMVPolicy(PreTrainedPolicy):
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except RuntimeError as error:
             raise ValueError(f"checkpoint {model_file} was made with another configuration: {error}") from error
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: Any = None,
+        dataset_meta: Any = None,
+    ) -> ModelCard:
+        """What LeRobot uploads as README.md with ``--policy.push_to_hub=true``; see ``model_card``."""
+        return model_card(self.config, cfg, dataset_meta, license, tags)
 
     def get_optim_params(self) -> Any:
         """All trainable parameters."""

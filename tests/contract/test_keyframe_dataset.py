@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from helpers.episodes import (
 from lerobot.datasets import LeRobotDataset, delete_episodes
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from dataset_tools import cli
+from dataset_tools import cli, hub
+from dataset_tools import keyframe as keyframe_command
 from dataset_tools.images import encode_depth
 from lerobot_histmv import keys
 
@@ -142,12 +144,14 @@ def test_the_same_seed_gives_the_same_data(tmp_path: Path) -> None:
 def test_without_roots_the_datasets_lie_where_lerobot_keeps_them_and_may_be_uploaded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    uploaded: list[tuple[str, Path]] = []
-    monkeypatch.setattr(LeRobotDataset, "push_to_hub", lambda self, **_: uploaded.append((self.repo_id, self.root)))
+    done: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(hub, "prepare", lambda *arguments: done.append(arguments))
+    monkeypatch.setattr(keyframe_command, "push_dataset", lambda *arguments: done.append(arguments))
     write_vector_picks(HF_LEROBOT_HOME / "test/home")
     cli.main(["keyframe", "--dataset.repo_id=test/home", "--output.repo_id=test/away", "--output.push_to_hub=true"])
     assert (HF_LEROBOT_HOME / "test/away" / keys.KEYFRAMING_FILE).is_file()
-    assert uploaded == [("test/away", (HF_LEROBOT_HOME / "test/away").resolve())]
+    root = (HF_LEROBOT_HOME / "test/away").resolve()
+    assert done == [("test/away", False), (root, "test/away", False, None)]
 
 
 def test_what_is_printed_tells_why_frames_were_kept_and_what_is_missing(

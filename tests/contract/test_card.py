@@ -1,0 +1,135 @@
+"""Cards state how data were made, so exactly that their commands make the same again; what people wrote stays."""
+
+import json
+import shlex
+from pathlib import Path
+from types import SimpleNamespace
+
+import draccus
+import pytest
+from fake_demonstrations import CAMERAS, FAILING_SEEDS, SIZE, recorder
+from helpers.episodes import snapshot, write_picks
+from huggingface_hub import DatasetCard, ModelCard
+from lerobot.datasets import LeRobotDatasetMetadata
+from tiny_policy import TASK, tiny_config, tiny_policy
+
+from dataset_tools import card, cli
+from dataset_tools.card_commands import record_command
+from dataset_tools.record import RecordConfig, checked_settings
+from dataset_tools.record_report import recording_report
+from dataset_tools.shards import Outcome
+from lerobot_histmv import keys
+
+KEYFRAMING = ["--method=exact", "--epsilon=0.003", "--pause.dwell=0.13", "--columns.commanded=false"]
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("card")
+    dense = write_picks(folder / "dense", count=3)
+    places = [f"--dataset.root={dense}", f"--output.root={folder / 'keys'}", "--dataset.episodes=[0,2]"]
+    names = ["--dataset.repo_id=ann/dense", "--output.repo_id=ann/keys"]
+    cli.main(["keyframe", *places, *names, *KEYFRAMING])
+    return folder / "keys"
+
+
+def written(root: Path, license: str | None = None) -> DatasetCard:
+    return card.dataset_card(root, LeRobotDatasetMetadata("ann/keys", root), license)
+
+
+def command_in(text: str, name: str) -> list[str]:
+    """Words of the command under "Made with"."""
+    _, _, made = text.partition("## Made with")
+    words = shlex.split(made.split("```")[1].removeprefix("bash").replace("\\\n", " "))
+    assert words[:2] == ["histmv", name]
+    return words[2:]
+
+
+def test_keyframed_card_states_method_errors_calibration_and_source(keyed: Path) -> None:
+    found, told = written(keyed), json.loads((keyed / keys.KEYFRAMING_FILE).read_text())
+    assert found.data["license"] == "apache-2.0"
+    assert {"LeRobot", "histmv", "keyframes", "rgb-d", "camera-calibration"} <= set(found.data["tags"])
+    assert found.data["task_categories"] == ["robotics"]
+    assert found.data["configs"][0]["data_files"] == "data/*/*.parquet"
+    for part in (
+        "`exact`",
+        "3 mm",
+        f"{1000 * told['totals']['error_mean']:.2f} mm per moving frame",
+        f"{1000 * told['totals']['error_max']:.1f} mm",
+        "gap to the exact optimum",
+        "datasets/ann/dense",
+        "| front | 19 x 17 | 20.00, 21.00, 9.00, 8.00 | 0.000, 0.000, 0.000 |",
+        "Quaternions: w, x, y, z",
+        'LeRobotDataset("ann/keys")',
+        "--dataset.repo_id=ann/keys",
+    ):
+        assert part in found.text, part
+
+
+def test_the_cards_command_makes_the_same_data_again(keyed: Path, tmp_path: Path) -> None:
+    words = command_in(written(keyed).text, "keyframe")
+    cli.main(["keyframe", *words, f"--dataset.root={keyed.parent / 'dense'}", f"--output.root={tmp_path / 'again'}"])
+    again, first = snapshot(tmp_path / "again"), snapshot(keyed)
+    assert [name for name in first if name.startswith("data/")]
+    assert all(again[name] == content for name, content in first.items() if name.startswith("data/"))
+
+
+def test_recordings_card_tells_the_success_and_its_command_has_the_same_settings(tmp_path: Path) -> None:
+    recorder(tmp_path / "dense").record(5, workers=1)
+    found = written(tmp_path / "dense")
+    assert f"5 of {5 + len(FAILING_SEEDS)} attempts" in found.text
+    assert f"{SIZE} x {SIZE}, cameras {', '.join(CAMERAS)}" in found.text
+    assert "keyframes" not in found.data["tags"]
+    words = command_in(found.text, "record")
+    assert {"--episodes=5", "--env.cameras=[left,right]"} <= set(words)
+
+
+@pytest.mark.parametrize(
+    "options", [["--env.task=set1", "--env.disturbances.depth=0.5"], ["--env.task=turn_tap", "--fps=5", "--seed=7"]]
+)
+def test_record_command_has_the_settings_of_the_recording(options: list[str]) -> None:
+    settings = checked_settings(draccus.parse(RecordConfig, args=[*options, "--env.cameras=[wrist,front]"]))
+    kept = Outcome(0, 0, "", 0, "", [], "", 1)
+    command = record_command(recording_report(settings, [kept] * 3 * len(settings.tasks)), "ann/dense")
+    words = shlex.split(command.replace("\\\n", " "))[2:]
+    again = draccus.parse(RecordConfig, args=words)
+    assert checked_settings(again) == settings
+    assert again.episodes == 3
+
+
+def test_what_people_wrote_stays(keyed: Path) -> None:
+    path = keyed / card.CARD_FILE
+    path.write_text("---\nlicense: mit\ntags:\n- mine\n---\n\nBefore.\n")
+    written(keyed).save(path)
+    assert path.read_text().count(card.BEGIN) == 1
+    path.write_text(path.read_text().replace("3 mm", "4 mm") + "\nAfter.\n")
+    found = written(keyed)
+    assert found.text.strip().startswith("Before.")
+    assert found.text.strip().endswith("After.")
+    assert "3 mm" in found.text
+    assert "4 mm" not in found.text
+    assert found.data["license"] == "mit"
+    assert {"mine", "LeRobot"} <= set(found.data["tags"])
+    assert written(keyed, "cc-by-4.0").data["license"] == "cc-by-4.0"
+    path.unlink()
+
+
+def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) -> None:
+    policy = tiny_policy(tiny_config(repo_id="ann/policy"))
+    training = SimpleNamespace(dataset=SimpleNamespace(repo_id="ann/keys"), steps=7, batch_size=3, seed=5)
+    meta = LeRobotDatasetMetadata("ann/keys", keyed)
+    found = policy.generate_model_card("ann/keys", "histmv", "mit", ["mine"], cfg=training, dataset_meta=meta)
+    assert isinstance(found, ModelCard)
+    assert found.data["license"] == "mit"
+    assert found.data["datasets"] == ["ann/keys"]
+    assert {"robotics", "lerobot", "histmv", "mine"} <= set(found.data["tags"])
+    for part in (
+        "key poses of | ann/dense",
+        "`exact`, epsilon 3 mm",
+        "7, batches of 3, seed 5",
+        "48 x 32 pixels",
+        "from camera to world",
+        f"* {TASK}",
+        "lerobot-eval --policy.path=ann/policy --env.type=ur5 --env.task=TASK --env.cameras=[front,wrist]",
+    ):
+        assert part in found.text, part
