@@ -27,6 +27,7 @@ def assemble(
     fps: int,
     repo_id: str,
     root: Path,
+    robot_type: str | None = ROBOT_TYPE,
 ) -> None:
     """Write the dataset that holds the shards of ``episodes``, in their order.
 
@@ -37,9 +38,10 @@ def assemble(
         fps: frames per second.
         repo_id: name of the dataset.
         root: where to write it; must not exist.
+        robot_type: what ``meta/info.json`` says about the robot.
     """
     meta = LeRobotDatasetMetadata.create(
-        repo_id, fps, dict(features), robot_type=ROBOT_TYPE, root=root, use_videos=False
+        repo_id, fps, dict(features), robot_type=robot_type, root=root, use_videos=False
     )
     paraphrases: dict[str, list[str]] = {}
     with DataFiles(meta) as files:

@@ -31,6 +31,10 @@ COMMANDS = {
     "record": Command(
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),
+    "convert": Command("dataset_tools.convert", "episodes of RLBench's or robomimic's format as a LeRobot dataset"),
+    "calibrate-attach": Command(
+        "dataset_tools.calibrate_attach", "add camera calibrations from a YAML file to a LeRobot dataset"
+    ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),

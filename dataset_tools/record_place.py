@@ -1,4 +1,4 @@
-"""Where a recording lives on disk, and what may happen there: resume, refuse, replace.
+"""Where a recording (or a conversion) lives on disk, and what may happen there: resume, refuse, replace.
 
 A recording of ``root`` works in ``<root>.parts``: its settings, a lock, one shard per finished attempt and, at the end,
 the dataset being assembled. ``root`` itself appears by a rename, whole or not at all.
@@ -6,18 +6,27 @@ the dataset being assembled. ``root`` itself appears by a rename, whole or not a
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from dataset_tools.locks import only_one
-from dataset_tools.record_settings import RecordSettings
 from dataset_tools.shards import write_json
 
 RECORDING_FILE = "meta/recording.json"
 """How a dataset was recorded: settings, seeds, attempts, success rate, versions."""
 _SETTINGS, _LOCK, _ASSEMBLED, _REPLACED = "settings.json", "lock", "dataset", "replaced"
+
+
+class Settings(Protocol):
+    """What decides the content of a dataset in the making."""
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as a JSON file gives it back."""
+
+    def check_same(self, found: Mapping[str, Any], where: Path, advice: str) -> None:
+        """Raise ValueError if the settings ``found`` at ``where`` are not these."""
 
 
 class RecordPlace:
@@ -29,7 +38,7 @@ class RecordPlace:
         overwrite: whether a dataset or a started recording that is in the way may be replaced.
     """
 
-    def __init__(self, root: Path, settings: RecordSettings, overwrite: bool) -> None:
+    def __init__(self, root: Path, settings: Settings, overwrite: bool) -> None:
         self.root = root
         self.parts = root.with_name(f"{root.name}.parts")
         self._settings, self._overwrite = settings, overwrite
@@ -64,14 +73,16 @@ class RecordPlace:
         """
         self.parts.mkdir(parents=True, exist_ok=True)
         self._refuse_foreign()
-        with only_one(self.parts, f"{self.root} is being recorded by another process", _LOCK):
+        with only_one(self.parts, f"{self.root} is being written by another process", _LOCK):
             self._take_over()
             yield self.parts
 
     def _refuse_foreign(self) -> None:
         names = {path.name for path in self.parts.iterdir() if path.suffix != ".tmp"}
         if names - {_LOCK} and _SETTINGS not in names:
-            raise ValueError(f"{self.parts} exists and was not made by a recording; choose another root")
+            raise ValueError(
+                f"{self.parts} exists and was not made by a recording or a conversion; choose another root"
+            )
 
     def _take_over(self) -> None:
         settings_file = self.parts / _SETTINGS

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dataset_tools.changed_settings import refuse_changes
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.motion import TICK
 
@@ -57,11 +58,4 @@ class RecordSettings:
 
     def check_same(self, found: Mapping[str, Any], where: Path, advice: str) -> None:
         """Raise ValueError if the settings ``found`` at ``where`` are not these."""
-        mine = self.as_json()
-        changes = [
-            f"{name} was {found.get(name)!r} and is now {mine[name]!r}"
-            for name in mine
-            if found.get(name) != mine[name]
-        ]
-        if changes:
-            raise ValueError(f"{where} was recorded with other settings: {', '.join(changes)}; {advice}")
+        refuse_changes(self.as_json(), found, where, advice)

@@ -89,7 +89,7 @@ def test_a_started_recording_is_only_continued_with_its_settings(tmp_path: Path)
 
 def test_a_working_directory_is_never_shared_nor_taken_from_others(tmp_path: Path) -> None:
     target = place(tmp_path / "data")
-    busy = pytest.raises(ValueError, match="being recorded by another process")
+    busy = pytest.raises(ValueError, match="being written by another process")
     with target.opened(), busy, place(tmp_path / "data").opened():
         pass
     (tmp_path / "other.parts").mkdir()
