@@ -136,4 +136,5 @@ def tool_poses(source: Source, columns: Columns, episode: int) -> Float[np.ndarr
     """``T_world_tool`` at every frame; ValueError names a frame whose quaternion is not unit."""
     closed_and_open = (0.0, 1.0)
     motion = trajectory_of(source.vectors(episode), columns, closed_and_open, float(source.meta.fps), episode)
+    assert motion.quaternion is not None
     return np.concatenate([matrix_from_quaternion(motion.quaternion), motion.position[..., None]], axis=-1)

@@ -1,8 +1,8 @@
 """An episode of another format in the terms of ours: conventions are changed here and nowhere else."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
@@ -84,7 +84,7 @@ class Episode:
         return columns
 
 
-class EpisodeSource(Protocol):
+class EpisodeSource(ABC):
     """Episodes of another format, found and described, not yet read.
 
     Attributes:
@@ -101,6 +101,7 @@ class EpisodeSource(Protocol):
     fps: int | None
     robot_type: str | None
 
+    @abstractmethod
     def read(self, index: int) -> Episode:
         """One episode; ValueError names what is wrong with it."""
 

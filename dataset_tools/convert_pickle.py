@@ -62,20 +62,12 @@ class _Scalar(_Array):
         self.contents = raw, dtype, (), "C"
 
 
-class _Latin1(metaclass=_Sealed):
-    """``_codecs.encode``, through which old protocols write bytes."""
-
-    def __new__(cls, text: str, *_: object) -> Any:
-        return text.encode("latin1")
-
-
 _CONTAINERS = (set, frozenset, list, tuple, dict)
 _ALLOWED: dict[tuple[str, str], type] = {
     ("rlbench.backend.observation", "Observation"): Record,
     ("rlbench.demo", "Demo"): Record,
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _DType,
-    ("_codecs", "encode"): _Latin1,
     **{("builtins", kind.__name__): kind for kind in _CONTAINERS},
 }
 for _core in ("numpy.core", "numpy._core"):
@@ -130,8 +122,7 @@ def numbers(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 def _plain(value: object) -> Any:
     if isinstance(value, _Array):
         raw, dtype, shape, order = value.contents
-        data = raw.encode("latin1") if isinstance(raw, str) else raw
-        return np.frombuffer(data, dtype.numpy()).reshape(shape, order=order)
+        return np.frombuffer(raw, dtype.numpy()).reshape(shape, order=order)
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     if not isinstance(value, bool | int | float):

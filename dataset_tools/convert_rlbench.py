@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 
-from dataset_tools.convert_episode import Camera, Episode, Motion, calibration, wxyz
+from dataset_tools.convert_episode import Camera, Episode, EpisodeSource, Motion, calibration, wxyz
 from dataset_tools.convert_pickle import Record, load, numbers
 
 OBSERVATIONS = "low_dim_obs.pkl"
@@ -27,7 +27,7 @@ DEPTH_CODES = 2**24 - 1
 _PLACES = ("episode*", "episodes/episode*", "*/episodes/episode*", "*/*/episodes/episode*")
 
 
-class RLBenchSource:
+class RLBenchSource(EpisodeSource):
     """The episodes below a folder: of a data set of tasks, a task, a variation, or its ``episodes``.
 
     Args:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from dataset_tools import convert_hdf5 as hdf5
-from dataset_tools.convert_episode import Camera, Episode, Motion, calibration, wxyz
+from dataset_tools.convert_episode import Camera, Episode, EpisodeSource, Motion, calibration, wxyz
 
 if TYPE_CHECKING:
     import h5py
@@ -25,7 +25,7 @@ _IN_HAND = "eye_in_hand"
 _ANY_IMAGE = (-1, -1, -1, 3)
 
 
-class RobomimicSource:
+class RobomimicSource(EpisodeSource):
     """The demonstrations of a file.
 
     Args:

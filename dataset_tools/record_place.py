@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from dataset_tools.locks import only_one
 from dataset_tools.shards import write_json
@@ -19,6 +19,7 @@ RECORDING_FILE = "meta/recording.json"
 _SETTINGS, _LOCK, _ASSEMBLED, _REPLACED = "settings.json", "lock", "dataset", "replaced"
 
 
+@runtime_checkable
 class Settings(Protocol):
     """What decides the content of a dataset in the making."""
 
