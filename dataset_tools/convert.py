@@ -1,19 +1,21 @@
 """``histmv convert``: episodes of RLBench's or robomimic's format become a dense LeRobot dataset."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from dataset_tools.assembly import assemble
 from dataset_tools.build import check_free
 from dataset_tools.changed_settings import refuse_changes
-from dataset_tools.convert_episode import EpisodeSource
+from dataset_tools.convert_episode import EpisodeSource, relative_to
 from dataset_tools.convert_rlbench import RLBenchSource
 from dataset_tools.convert_robomimic import RobomimicSource
 from dataset_tools.dense_features import arm_features
@@ -42,7 +44,7 @@ class ConvertConfig:
     # rlbench: a folder of tasks, one task, one variation or its episodes. robomimic: the file.
     source: Path
     output: OutputPlace
-    # Cameras to convert, in this order, e.g. [front,wrist]; by default all with colour, depth.
+    # Cameras to convert, in this order, e.g. [front,wrist]; by default all with colour and depth.
     cameras: list[str] = field(default_factory=list)
     # What the arm was asked for, all paraphrases; by default what the source says.
     instructions: list[str] = field(default_factory=list)
@@ -51,6 +53,8 @@ class ConvertConfig:
     # Where the source's camera matrices place the centre of the first pixel. 0.5: they count from its corner, as those
     # of CoppeliaSim and robosuite do (cx = W / 2). 0: from its centre, as OpenCV and librealsense do.
     pixel_centre: float = 0.5
+    # Where the robot's base is in the source's world [m]; it becomes the origin. The axes stay as they are.
+    base: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     # Distance between the fingers of an open gripper [m], for robomimic; that of the Panda is 0.08.
     gripper_width: float = 0.08
     # Episodes converted at the same time.
@@ -62,6 +66,8 @@ class ConvertConfig:
         for name, value in (("workers", self.workers), ("gripper_width", self.gripper_width), ("fps", self.fps or 1)):
             if value <= 0:
                 raise ValueError(f"{name} is {value}; it must be above 0")
+        if len(self.base) != 3:
+            raise ValueError(f"base is {self.base}; it must be x, y, z [m]")
         if any(not sentence.strip() for sentence in self.instructions):
             raise ValueError(f"instructions are {self.instructions}; each must say something")
 
@@ -78,6 +84,7 @@ class ConvertSettings:
         instructions: given ones.
         fps: frames per second.
         pixel_centre: as configured.
+        base: as configured.
         gripper_width: as configured.
     """
 
@@ -88,6 +95,7 @@ class ConvertSettings:
     instructions: list[str]
     fps: int
     pixel_centre: float
+    base: list[float]
     gripper_width: float
 
     def as_json(self) -> dict[str, Any]:
@@ -116,7 +124,8 @@ def run(config: ConvertConfig) -> None:
         with progress_bar(console) as progress:
             total = len(source.names)
             bar = progress.add_task("converting", total=total, completed=len(outcomes))
-            for outcome in convert(source, parts, missing_attempts(outcomes, total), config.workers):
+            convert_one = partial(convert_episode, source, parts, np.array(config.base, dtype=np.float64))
+            for outcome in convert(convert_one, missing_attempts(outcomes, total), config.workers):
                 outcomes[outcome.attempt] = outcome
                 progress.advance(bar)
         made = made_attempts(outcomes, total)
@@ -149,17 +158,18 @@ def settings_of(config: ConvertConfig, source: EpisodeSource) -> ConvertSettings
         instructions=config.instructions,
         fps=config.fps or source.fps or DEFAULT_FPS,
         pixel_centre=config.pixel_centre,
+        base=config.base,
         gripper_width=config.gripper_width,
     )
 
 
-def convert(source: EpisodeSource, parts: Path, indices: Sequence[int], workers: int) -> Iterator[Outcome]:
-    """Convert these episodes into shards, several at a time, and tell of each when it is committed.
+def convert(convert_one: Callable[[int], Outcome], indices: Sequence[int], workers: int) -> Iterator[Outcome]:
+    """Convert these episodes, several at a time, and tell of each when its shard is committed.
 
     Threads do: decoding and encoding images, nine tenths of the work, runs outside of the interpreter's lock.
     """
     with ThreadPoolExecutor(workers) as pool:
-        waiting = [pool.submit(convert_episode, source, parts, index) for index in indices]
+        waiting = [pool.submit(convert_one, index) for index in indices]
         try:
             for done in as_completed(waiting):
                 yield done.result()
@@ -167,10 +177,9 @@ def convert(source: EpisodeSource, parts: Path, indices: Sequence[int], workers:
             pool.shutdown(cancel_futures=True)
 
 
-def convert_episode(source: EpisodeSource, parts: Path, index: int) -> Outcome:
+def convert_episode(source: EpisodeSource, parts: Path, base: Float[np.ndarray, " 3"], index: int) -> Outcome:
     """Convert one episode and commit its shard. Its instruction is the paraphrase whose turn it is."""
-    episode = source.read(index)
-    columns = episode.columns()
+    episode = relative_to(source.read(index), base)
     outcome = Outcome(
         attempt=index,
         seed=index,
@@ -181,7 +190,7 @@ def convert_episode(source: EpisodeSource, parts: Path, index: int) -> Outcome:
         failure="",
         rows=len(episode.motion.position),
     )
-    return commit_episode(parts, outcome, columns)
+    return commit_episode(parts, outcome, episode.columns())
 
 
 def _write(

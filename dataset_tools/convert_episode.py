@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
@@ -82,6 +82,15 @@ class Episode:
         columns[keys.EXTRINSICS] = np.hstack([camera.extrinsics for camera in cameras]).astype(np.float32)
         columns[keys.ACTION] = self.motion.action()
         return columns
+
+
+def relative_to(episode: Episode, base: Float[np.ndarray, " 3"]) -> Episode:
+    """The same episode in a world whose origin is at ``base`` [m] and whose axes are the old ones."""
+    shift = np.zeros(12)
+    shift[3::4] = base
+    cameras = {name: replace(camera, extrinsics=camera.extrinsics - shift) for name, camera in episode.cameras.items()}
+    motion = replace(episode.motion, position=episode.motion.position - base)
+    return replace(episode, cameras=cameras, motion=motion)
 
 
 class EpisodeSource(ABC):

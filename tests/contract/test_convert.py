@@ -146,6 +146,20 @@ def test_a_broken_conversion_goes_on_where_it_stopped(tmp_path: Path, monkeypatc
     )
 
 
+def test_the_robots_base_becomes_the_origin(dataset: LeRobotDataset, tmp_path: Path) -> None:
+    write_rlbench(tmp_path / "in/episode0", SCENES[0])
+    cli.main(command("rlbench", tmp_path / "in", tmp_path / "out", "--base=[-0.3,0.1,0.75]"))
+    moved = LeRobotDataset("test/converted", root=tmp_path / "out")
+    base = np.array([-0.3, 0.1, 0.75])
+    sample, before = moved[1], dataset[1]
+    for key in (keys.STATE, keys.ACTION):
+        assert sample[key][:3].numpy() == pytest.approx(before[key][:3].numpy() - base, abs=1e-6)
+        assert sample[key][3:].numpy() == pytest.approx(before[key][3:].numpy(), abs=1e-6)
+    found, old = (one[keys.EXTRINSICS].numpy().reshape(2, 3, 4) for one in (sample, before))
+    assert found[..., :3] == pytest.approx(old[..., :3])
+    assert found[..., 3] == pytest.approx(old[..., 3] - base, abs=1e-6)
+
+
 def test_nothing_is_overwritten_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_rlbench(tmp_path / "in/episode0", Scene(frames=2))
     arguments = command("rlbench", tmp_path / "in", tmp_path / "out")
