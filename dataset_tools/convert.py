@@ -166,7 +166,7 @@ def settings_of(config: ConvertConfig, source: EpisodeSource) -> ConvertSettings
 def convert(convert_one: Callable[[int], Outcome], indices: Sequence[int], workers: int) -> Iterator[Outcome]:
     """Convert these episodes, several at a time, and tell of each when its shard is committed.
 
-    Threads do: decoding and encoding images, nine tenths of the work, runs outside of the interpreter's lock.
+    Threads do, since decoding and encoding images run outside of the interpreter's lock.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting = [pool.submit(convert_one, index) for index in indices]
