@@ -29,6 +29,9 @@ CONVERSION_FILE = "meta/conversion.json"
 """Where each episode of a converted dataset comes from."""
 DEFAULT_FPS = 20
 
+Format = Literal["rlbench", "robomimic"]
+"""Has a name because draccus finds no comment of an option whose annotation holds quotes."""
+
 
 @dataclass
 class ConvertConfig:
@@ -40,7 +43,7 @@ class ConvertConfig:
     """
 
     # rlbench (folders of PNG files and pickles, as RLBench's and PerAct's generators write them) or robomimic (HDF5).
-    format: Literal["rlbench", "robomimic"]
+    format: Format
     # rlbench: a folder of tasks, one task, one variation or its episodes. robomimic: the file.
     source: Path
     output: OutputPlace
