@@ -41,6 +41,7 @@ def assemble(
     fps: int,
     repo_id: str,
     root: Path,
+    robot_type: str | None = ROBOT_TYPE,
 ) -> None:
     """Write the dataset that holds the shards of recorded ``episodes``, in their order.
 
@@ -51,6 +52,7 @@ def assemble(
         fps: frames per second.
         repo_id: name of the dataset.
         root: where to write it; must not exist.
+        robot_type: what ``meta/info.json`` says about the robot.
     """
     paraphrases: dict[str, list[str]] = {}
 
@@ -60,7 +62,7 @@ def assemble(
             yield Episode(table, [outcome.instruction] * table.num_rows, as_arrays(outcome.statistics))
             paraphrases[outcome.instruction] = outcome.paraphrases
 
-    write_dataset(recorded(), features, fps, repo_id, root, ROBOT_TYPE)
+    write_dataset(recorded(), features, fps, repo_id, root, robot_type)
     write_json(root / keys.INSTRUCTIONS_FILE, paraphrases)
 
 

@@ -31,6 +31,10 @@ COMMANDS = {
     "record": Command(
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),
+    "convert": Command("dataset_tools.convert", "episodes of RLBench's or robomimic's format as a LeRobot dataset"),
+    "calibrate-attach": Command(
+        "dataset_tools.calibrate_attach", "add camera calibrations from a YAML file to a LeRobot dataset"
+    ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
     "push": Command("dataset_tools.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),

@@ -16,8 +16,6 @@ JOINT_NAMES = tuple(
 )
 """The six joint angles [rad] that follow the measured pose in ``observation.state``."""
 
-STATE_NAMES = (*keys.POSE_NAMES, *JOINT_NAMES)
-
 
 def dense_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[str, Any]]:
     """LeRobot feature dictionary of a dense dataset, in column order.
@@ -30,17 +28,35 @@ def dense_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[st
         Per camera an RGB and a depth image (uint16 mm, 0 = invalid), then state (14), intrinsics (4 per camera: fx fy
         cx cy), extrinsics (12 per camera: rows of the 3x4 ``T_world_cam``) and action (8), all float32.
     """
+    return arm_features(dict.fromkeys(cameras, (image_size, image_size)), JOINT_NAMES)
+
+
+def arm_features(sizes: Mapping[str, tuple[int, int]], joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The same for any arm and any cameras.
+
+    Args:
+        sizes: height and width [pixels] of each camera's images, in the order of the calibration vectors.
+        joint_names: what follows the measured pose in the state.
+    """
+    cameras = list(sizes)
     features: dict[str, dict[str, Any]] = {}
-    for camera in cameras:
-        features[keys.rgb_key(camera)] = _image(image_size, channels=3)
-    for camera in cameras:
+    for camera, size in sizes.items():
+        features[keys.rgb_key(camera)] = _image(size, channels=3)
+    for camera, size in sizes.items():
         info = {"is_depth_map": True, "depth_unit": "mm"}
-        features[keys.depth_key(camera)] = {**_image(image_size, channels=1), "info": info}
-    features[keys.STATE] = _vector(STATE_NAMES)
-    features[keys.INTRINSICS] = _vector(keys.intrinsics_names(cameras))
-    features[keys.EXTRINSICS] = _vector(keys.extrinsics_names(cameras))
+        features[keys.depth_key(camera)] = {**_image(size, channels=1), "info": info}
+    features[keys.STATE] = _vector((*keys.POSE_NAMES, *joint_names))
+    features |= calibration_features(cameras)
     features[keys.ACTION] = _vector(keys.POSE_NAMES)
     return features
+
+
+def calibration_features(cameras: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """LeRobot features of the two calibration vectors."""
+    return {
+        keys.INTRINSICS: _vector(keys.intrinsics_names(cameras)),
+        keys.EXTRINSICS: _vector(keys.extrinsics_names(cameras)),
+    }
 
 
 def frame_columns(observation: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, np.ndarray]:
@@ -53,8 +69,8 @@ def frame_columns(observation: Mapping[str, Any], cameras: Sequence[str]) -> dic
     return columns
 
 
-def _image(image_size: int, channels: int) -> dict[str, Any]:
-    return {"dtype": "image", "shape": (image_size, image_size, channels), "names": ["height", "width", "channels"]}
+def _image(size: tuple[int, int], channels: int) -> dict[str, Any]:
+    return {"dtype": "image", "shape": (*size, channels), "names": ["height", "width", "channels"]}
 
 
 def _vector(names: Sequence[str]) -> dict[str, Any]:
