@@ -31,6 +31,9 @@ COMMANDS = {
     "record": Command(
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),
+    "doctor": Command(
+        "dataset_tools.doctor", "what is wrong with a LeRobot dataset, and how to mend it, before training"
+    ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),

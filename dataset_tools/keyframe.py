@@ -26,7 +26,7 @@ from lerobot_histmv import keys
 
 @dataclass
 class SourceConfig:
-    """The dense dataset to read."""
+    """The dataset to read."""
 
     # Name, such as user/demonstrations. Without a root it is looked for locally, then on the Hub, as LeRobot does.
     repo_id: str
