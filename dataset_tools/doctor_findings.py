@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Self
 
 
 class Severity(StrEnum):
@@ -149,7 +148,7 @@ CHECKS = {
     "extrinsics_rotation": Check(
         _E,
         "the rotation of T_world_cam is no rotation: its columns are not orthonormal, or mirrored",
-        "store rows of the 3x4 matrix [R | t] as float32; check that it is not transposed, scaled or quantised",
+        "store rows of the 3x4 matrix [R t] as float32; check that it is not transposed, scaled or quantised",
     ),
     "extrinsics_constant": Check(
         _E,
@@ -211,7 +210,7 @@ class Finding:
         severity: as of its check, or milder.
         episode: where; None where it concerns all of them.
         frame: where; None where it concerns all of them.
-        camera: which; empty where it concerns none.
+        camera: which, or which two; empty where it concerns none.
     """
 
     check: str
@@ -230,7 +229,7 @@ class Finding:
         frame: int | None = None,
         camera: str = "",
         severity: Severity | None = None,
-    ) -> Self:
+    ) -> "Finding":
         """A finding with its check's severity, unless another is given."""
         return cls(check, message, severity or CHECKS[check].severity, episode, frame, camera)
 

@@ -60,13 +60,14 @@ def views_disagree(instants: Sequence[Instant], episode: int) -> list[Finding]:
         if len(gaps) < FEWEST or np.median(gaps) <= APART:
             continue
         median = float(np.median(gaps))
-        message = f"{first} and {second} are {100 * median:.1f} cm apart (median of {len(gaps)} common points)"
+        message = f"{100 * median:.1f} cm apart (median of {len(gaps)} common points)"
         for convention, convert in OTHER_CONVENTIONS.items():
             others = surface_gaps(converted(instants, convert), first, second)
             if len(others) >= FEWEST and np.median(others) < min(APART, median / 2):
                 message += f", but only {100 * np.median(others):.1f} cm if {convention}"
         severity = Severity.ERROR if median > FAR_APART else Severity.WARNING
-        found.append(Finding.of("views_disagree", message, episode, severity=severity))
+        both = f"{first}, {second}"
+        found.append(Finding.of("views_disagree", message, episode, camera=both, severity=severity))
     return found
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from dataset_tools.doctor_examine import Examination
 from dataset_tools.doctor_findings import Finding, Severity
@@ -45,8 +46,8 @@ def table(findings: Sequence[Finding]) -> Table:
         shown.add_column(heading, ratio=3 if heading.startswith("what") else None, overflow="fold")
     for group in grouped(findings):
         first = group[0]
-        severity = f"[{STYLES[first.severity]}]{first.severity}"
-        shown.add_row(severity, first.check, where(group), first.message, first.remedy)
+        severity = Text(first.severity, STYLES[first.severity])
+        shown.add_row(severity, *map(Text, (first.check, where(group), first.message, first.remedy)))
     return shown
 
 

@@ -62,7 +62,7 @@ def tool_jumps(position: Float[np.ndarray, "n 3"], episode: int) -> list[Finding
     steps = np.linalg.norm(np.diff(position, axis=0), axis=-1)
     if len(steps) < JUMP_RATIO:
         return []
-    usual = float(np.percentile(steps, 95))
+    usual = float(np.percentile(steps, 95, method="lower"))
     bad = np.flatnonzero(steps > max(JUMP, JUMP_RATIO * usual))
     if not len(bad):
         return []
