@@ -115,7 +115,8 @@ def holds(
     size: tuple[int, int],
 ) -> bool:
     """Whether a world point [m] lies in an image of ``size`` (rows, columns)."""
-    (u, v), _ = project(point, intrinsics, extrinsics)
+    pixels, _ = project(point[None], intrinsics, extrinsics)
+    u, v = pixels[0]
     return bool(-0.5 <= u <= size[1] - 0.5 and -0.5 <= v <= size[0] - 0.5)
 
 

@@ -14,7 +14,7 @@ from dataset_tools.doctor_layout import describe
 from dataset_tools.doctor_numbers import check_numbers, unusable
 from dataset_tools.doctor_read import EpisodeRows, episode_rows
 from dataset_tools.doctor_vectors import digest, same_episodes
-from dataset_tools.doctor_views import check_images, views_apart
+from dataset_tools.doctor_views import check_images
 from dataset_tools.source import Source
 
 
@@ -60,15 +60,11 @@ def examine(
                 kept[episode] = rows
         on_episode()
     findings += same_episodes(digests)
-    overlaps = []
     for episode in sorted(chosen):
         if episode in kept:
             faulty = {finding.camera for finding in findings if finding.severity == Severity.ERROR}
-            found, overlap = check_images(source, layout, kept[episode], faulty)
-            findings += found
-            overlaps.append(overlap)
+            findings += check_images(source, layout, kept[episode], faulty)
         on_episode()
-    findings += views_apart(overlaps)
     if not for_histmv:
         findings = [noted(finding) for finding in findings]
     return Examination(tuple(dict.fromkeys(findings)), len(source.episodes), frames, len(kept))

@@ -61,19 +61,28 @@ def views_disagree(instants: Sequence[Instant], episode: int) -> list[Finding]:
             continue
         median = float(np.median(gaps))
         message = f"{100 * median:.1f} cm apart (median of {len(gaps)} common points)"
-        for convention, convert in OTHER_CONVENTIONS.items():
-            others = surface_gaps(converted(instants, convert), first, second)
-            if len(others) >= FEWEST and np.median(others) < min(APART, median / 2):
-                message += f", but only {100 * np.median(others):.1f} cm if {convention}"
         severity = Severity.ERROR if median > FAR_APART else Severity.WARNING
         both = f"{first}, {second}"
+        message += better_convention(instants, first, second)
         found.append(Finding.of("views_disagree", message, episode, camera=both, severity=severity))
     return found
 
 
-def overlap(instants: Sequence[Instant]) -> bool:
-    """Whether any two views have enough points in common."""
-    return any(len(surface_gaps(instants, *pair)) >= FEWEST for pair in pairs(instants))
+def views_apart(instants: Sequence[Instant], episode: int) -> list[Finding]:
+    """Some two views have enough points in common."""
+    if not pairs(instants) or any(len(surface_gaps(instants, *pair)) >= FEWEST for pair in pairs(instants)):
+        return []
+    better = next(filter(None, (better_convention(instants, *pair) for pair in pairs(instants))), "")
+    return [Finding.of("views_apart", f"in {len(instants)} frames looked at{better}", episode)]
+
+
+def better_convention(instants: Sequence[Instant], first: str, second: str) -> str:
+    """End of a message: the convention, if any, in which two views would agree."""
+    for convention, convert in OTHER_CONVENTIONS.items():
+        gaps = surface_gaps(converted(instants, convert), first, second)
+        if len(gaps) >= FEWEST and np.median(gaps) < APART:
+            return f"; they would agree to {100 * np.median(gaps):.1f} cm if {convention}"
+    return ""
 
 
 def pairs(instants: Sequence[Instant]) -> list[tuple[str, str]]:
@@ -97,11 +106,20 @@ def one_way(seen: DepthView, other: DepthView) -> Float[np.ndarray, " n"]:
     pixels, z = project(points, other.intrinsics, other.extrinsics)
     rows, columns = other.depth.shape
     with np.errstate(invalid="ignore"):
-        within = ((pixels > -0.5) & (pixels < np.array([columns, rows]) - 0.5)).all(axis=-1)
-    u, v = np.rint(pixels[within]).astype(int).T
-    surface = other.depth[v, u]
-    behind = z[within] - surface
-    return np.abs(behind[(surface > 0) & (behind < HIDDEN)])
+        within = ((pixels >= 0) & (pixels <= np.array([columns, rows]) - 1)).all(axis=-1)
+    behind = z[within] - depth_at(other.depth, pixels[within])
+    return np.abs(behind[behind < HIDDEN])
+
+
+def depth_at(depth: Float[np.ndarray, "y x"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Depth [m] between pixel centres (u, v), NaN beside invalid ones; linear in 1 / z, which is exact on planes."""
+    inverse = np.divide(1.0, depth, out=np.full(depth.shape, np.nan), where=depth > 0)
+    rows, columns = depth.shape
+    corners = np.minimum(np.floor(pixels).astype(int), np.array([columns, rows]) - 2)
+    (u, v), (right, down) = corners.T, (pixels - corners).T
+    upper = (1 - right) * inverse[v, u] + right * inverse[v, u + 1]
+    lower = (1 - right) * inverse[v + 1, u] + right * inverse[v + 1, u + 1]
+    return 1 / ((1 - down) * upper + down * lower)
 
 
 def converted(instants: Sequence[Instant], convert: Callable[[np.ndarray], np.ndarray]) -> list[Instant]:

@@ -139,7 +139,7 @@ def tool_columns(features: Features, config: ColumnsConfig) -> tuple[Columns | N
         found.append(Finding.of("tool_pose_missing", f"told were joints, {columns.curve}"))
     elif columns.rotation is None:
         found.append(Finding.of("tool_pose_missing", f"there is a position, {columns.curve}, but no rotation"))
-    if columns.commanded is None:
+    elif columns.commanded is None:
         names = entry_names(features[keys.ACTION]) if keys.ACTION in features else ()
         found.append(Finding.of("action_pose_missing", f"action has {', '.join(names) or 'no names'}"))
     return columns, found

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from dataset_tools import doctor_calibration, doctor_poses, doctor_vectors
 from dataset_tools.columns import Columns, vectors
-from dataset_tools.doctor_findings import Finding
+from dataset_tools.doctor_findings import Finding, Severity
 from dataset_tools.doctor_layout import Layout
 from dataset_tools.doctor_read import EpisodeRows
 from dataset_tools.source import Source
@@ -29,7 +29,7 @@ def unusable(source: Source, rows: EpisodeRows) -> list[Finding]:
 def check_numbers(source: Source, layout: Layout, rows: EpisodeRows) -> list[Finding]:
     """Checks of the numbers of an episode that is whole."""
     episode, columns = rows.episode, layout.columns
-    found = doctor_vectors.time_gaps(rows.timestamp, source.meta.fps, episode)
+    found = doctor_vectors.time_gaps(rows.timestamp, float(source.meta.fps), episode)
     found += instructions(source, rows)
     found += doctor_vectors.repeated_rows(rows.vectors, episode)
     calibration = check_calibration(layout, rows)
@@ -37,9 +37,11 @@ def check_numbers(source: Source, layout: Layout, rows: EpisodeRows) -> list[Fin
         if not source.is_keyframed:
             found += doctor_vectors.tool_jumps(columns.curve.of(rows.vectors), episode)
         moving = {} if calibration else moving_cameras(layout, rows)
-        found += check_rotations(columns, rows, moving)
-        within = 1 if source.is_keyframed else max(1, round(PATIENCE * source.meta.fps))
-        found += check_action(columns, rows, within)
+        rotations = check_rotations(columns, rows, moving)
+        if all(finding.severity != Severity.ERROR for finding in rotations):
+            within = 1 if source.is_keyframed else max(1, round(PATIENCE * source.meta.fps))
+            rotations += check_action(columns, rows, within)
+        found += rotations
     return found + calibration
 
 

@@ -1,6 +1,6 @@
 """Checks of one episode's sampled images: of each camera alone, then of cameras that are right against each other."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Set
 
 from dataset_tools import doctor_geometry, doctor_images
 from dataset_tools.doctor_calibration import evenly
@@ -14,10 +14,8 @@ FRAMES = 4
 """Frames looked at in an episode, first and last among them."""
 
 
-def check_images(
-    source: Source, layout: Layout, rows: EpisodeRows, faulty: Set[str]
-) -> tuple[list[Finding], bool | None]:
-    """Findings of an episode, and whether any two views see a common surface (None: fewer than two are right).
+def check_images(source: Source, layout: Layout, rows: EpisodeRows, faulty: Set[str]) -> list[Finding]:
+    """Findings of an episode.
 
     Args:
         source: the dataset.
@@ -37,9 +35,11 @@ def check_images(
     }
     instants = [instant(layout, rows, views, frame) for frame in frames]
     moving = doctor_geometry.camera_moves(instants, rows.episode)
-    if moving or len(views) < 2:
-        return found + moving, None
-    return found + doctor_geometry.views_disagree(instants, rows.episode), doctor_geometry.overlap(instants)
+    compared = moving or [
+        *doctor_geometry.views_disagree(instants, rows.episode),
+        *doctor_geometry.views_apart(instants, rows.episode),
+    ]
+    return found + compared
 
 
 def check_camera(layout: Layout, camera: str, seen: Pictures, rows: EpisodeRows) -> list[Finding]:
@@ -67,11 +67,3 @@ def instant(layout: Layout, rows: EpisodeRows, views: dict[str, Pictures], frame
         for camera, seen in views.items()
         if frame in seen.depth
     ]
-
-
-def views_apart(overlaps: Sequence[bool | None]) -> list[Finding]:
-    """Some two views overlap in some episode; ``overlaps`` are those of ``check_images``."""
-    told = [overlap for overlap in overlaps if overlap is not None]
-    if not told or any(told):
-        return []
-    return [Finding.of("views_apart", f"in none of {len(told)} episodes looked at")]

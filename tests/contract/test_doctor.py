@@ -220,7 +220,7 @@ def depth_video(root: Path) -> None:
 
 
 BLACK = encode_rgb(np.zeros((*RIG.size, 3), np.uint8))
-APART = Rig({"front": STILL["front"], "back": look_at((-0.6, 0.5, 0.5), (-1.2, 0.9, 0.0))}, moving="")
+APART = Rig({"front": STILL["front"], "back": look_at((1.5, 0.5, 0.5), (2.2, 0.9, 0.0))}, moving="")
 NAMELESS = Rig({"front": STILL["front"], "side": STILL["side"]}, moving="third")
 METRES: dict[str, Any] = {"info": {"is_depth_map": True, "depth_unit": "m"}}
 
@@ -240,14 +240,14 @@ BROKEN: list[tuple[str, Spoil]] = [
     ("intrinsics_missing", without(keys.INTRINSICS)),
     ("intrinsics_missing", renamed(keys.INTRINSICS, "front.", "camera_0.")),
     ("extrinsics_missing", without(keys.EXTRINSICS)),
-    ("tool_pose_missing", renamed(keys.STATE, "ee.", "entry_")),
-    ("tool_pose_missing", renamed(keys.STATE, ".q", ".unknown_q")),
+    ("tool_pose_missing", feature(keys.STATE, names=list("abcdefgh"))),
+    ("tool_pose_missing", feature(keys.STATE, names=[*keys.POSITION_NAMES, *"abcd", keys.GRIPPER_NAME])),
     ("action_pose_missing", renamed(keys.ACTION, "ee.", "delta_")),
     ("nan", numbers(keys.STATE, spoilt_at(5, 1, np.nan))),
     ("nan", numbers(keys.EXTRINSICS, spoilt_at(5, 1, np.inf))),
     ("time_gap", numbers("timestamp", late)),
     ("tool_jump", frames([*range(5), *range(17, 23)])),
-    ("duplicate_rows", frames([i - i % 3 for i in range(23)])),
+    ("duplicate_rows", frames([i - i % 2 for i in range(23)])),
     ("duplicate_episode", frames(list(range(11)), list(range(12, 23)), list(range(11)))),
     ("quaternion_norm", numbers(keys.STATE, scaled(3, 7, 0.9))),
     ("quaternion_order", tool(as_xyzw)),
@@ -268,7 +268,7 @@ BROKEN: list[tuple[str, Spoil]] = [
     ("image_frozen", freeze),
     ("depth_unit", depth(lambda image: np.rint(image / 1000).astype(np.uint16))),
     ("depth_unit", both(depth(lambda image: image.astype(np.float32)), feature(FRONT_DEPTH, **METRES))),
-    ("nan", depth(lambda image: np.where(image > 500, np.nan, image / 1000).astype(np.float32))),
+    ("nan", depth(lambda image: np.where(np.arange(len(image))[:, None] < 3, np.nan, image).astype(np.float32))),
     ("depth_invalid", depth(nearly_blind)),
     ("tool_outside", tool(shifted(0, 2.0))),
     ("tool_outside", tool(scaled(0, 3, 1000.0))),

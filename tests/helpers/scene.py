@@ -74,6 +74,7 @@ def episode(rig: Rig, length: int, seed: int) -> list[Frame]:
     gripper = (np.arange(length) < length // 2).astype(float)
     pose = np.column_stack([position, quaternion, gripper])
     action = np.vstack([pose[1:], pose[-1:]])
+    noise = np.random.default_rng(seed)
     frames = []
     for i in range(length):
         rotation = matrix_from_quaternion(quaternion[i])
@@ -84,7 +85,8 @@ def episode(rig: Rig, length: int, seed: int) -> list[Frame]:
         frame[keys.EXTRINSICS] = np.concatenate([one.ravel() for one in poses.values()]).astype(np.float32)
         for camera, camera_pose in poses.items():
             colour, depth = ray_cast(rig, camera_pose, position[i])
-            frame[keys.rgb_key(camera)], frame[keys.depth_key(camera)] = colour, depth
+            frame[keys.rgb_key(camera)] = colour + noise.integers(0, 5, colour.shape, np.uint8)
+            frame[keys.depth_key(camera)] = depth
         frames.append(frame)
     return frames
 
