@@ -16,6 +16,8 @@ from dataset_tools.keyframe import SourceConfig
 from dataset_tools.shards import write_json
 from dataset_tools.source import Source, open_dataset
 
+Policy = Literal["histmv", "any"]
+
 
 @dataclass
 class DoctorConfig:
@@ -35,7 +37,7 @@ class DoctorConfig:
     # Episodes, evenly spread, of which images are decoded (4 frames each); a large number takes all of them.
     sampled_episodes: int = 10
     # What is to be trained. With any, what only histmv needs (depth, calibration, a tool pose) is noted, not an error.
-    policy: Literal["histmv", "any"] = "histmv"
+    policy: Policy = "histmv"
     # Also write all findings to this JSON file.
     json: Path | None = None
 
