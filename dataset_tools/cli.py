@@ -35,6 +35,9 @@ COMMANDS = {
     "calibrate-attach": Command(
         "dataset_tools.calibrate_attach", "add camera calibrations from a YAML file to a LeRobot dataset"
     ),
+    "doctor": Command(
+        "dataset_tools.doctor", "what is wrong with a LeRobot dataset, and how to mend it, before training"
+    ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
     "push": Command("dataset_tools.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),

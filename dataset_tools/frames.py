@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, Shaped, UInt8, UInt16
 from lerobot.configs.video import DepthEncoderConfig
 from lerobot.datasets.depth_utils import dequantize_depth
 from lerobot.datasets.video_utils import decode_video_frames
@@ -16,7 +16,8 @@ from dataset_tools.images import encode_depth, encode_rgb
 from dataset_tools.source import Source
 
 _LARGEST_MM = np.iinfo(np.uint16).max
-_MM_PER = {"m": 1000.0, "mm": 1.0}
+MM_PER = {"m": 1000.0, "mm": 1.0}
+"""Units of stored depth."""
 _TOLERANCE_S = 1e-3
 
 
@@ -64,20 +65,28 @@ def millimetres(depth: Float[np.ndarray, "y x"], unit: str, where: str) -> UInt1
     valid = np.isfinite(depth) & (depth >= 0)
     if not valid.all():
         raise ValueError(f"{where} holds {depth[~valid][0]}; depth must be finite, with 0 where nothing was measured")
-    scaled = np.rint(depth * _MM_PER[unit])
+    scaled = np.rint(depth * MM_PER[unit])
     return np.where(scaled > _LARGEST_MM, 0, scaled).astype(np.uint16)
 
 
-def _depth(source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table) -> CameraFrames:
+def stored_depth(
+    source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table
+) -> tuple[Shaped[np.ndarray, "n y x"], str]:
+    """Depth images as they are stored and the unit, m or mm, that they are declared or understood to be in.
+
+    Args and errors as of ``camera_frames``.
+    """
     info = source.features[key].get("info") or {}
     if source.features[key]["dtype"] == "video":
-        raw, unit = _dequantized(_decoded(source, episode, key, frames, stored), info), "m"
-    else:
-        files = _files(stored, episode, key)
-        raw = np.stack([np.asarray(Image.open(io.BytesIO(file))) for file in files])
-        unit = info.get("depth_unit") or ("mm" if np.issubdtype(raw.dtype, np.integer) else "m")
-        if raw.dtype == np.uint16 and unit == "mm":
-            return CameraFrames(files, raw[..., None])
+        return _dequantized(_decoded(source, episode, key, frames, stored), info), "m"
+    raw = np.stack([np.asarray(Image.open(io.BytesIO(file))) for file in _files(stored, episode, key)])
+    return raw, info.get("depth_unit") or ("mm" if np.issubdtype(raw.dtype, np.integer) else "m")
+
+
+def _depth(source: Source, episode: int, key: str, frames: Sequence[int], stored: pa.Table) -> CameraFrames:
+    raw, unit = stored_depth(source, episode, key, frames, stored)
+    if raw.dtype == np.uint16 and unit == "mm":
+        return CameraFrames(_files(stored, episode, key), raw[..., None])
     depth = [
         millimetres(image.astype(np.float64), unit, f"episode {episode}, frame {frame}: {key}")
         for image, frame in zip(raw, frames, strict=True)

@@ -29,7 +29,7 @@ from dataset_tools.workplace import Workplace
 
 @dataclass
 class SourceConfig:
-    """The dense dataset to read."""
+    """The dataset to read."""
 
     # Name, such as user/demonstrations. Without a root it is looked for locally, then on the Hub, as LeRobot does.
     repo_id: str

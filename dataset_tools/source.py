@@ -1,4 +1,4 @@
-"""Reading the episodes that are to be keyframed: any LeRobot v3 dataset, checked before anything is written."""
+"""Reading the episodes of any LeRobot v3 dataset, whose files are checked before anything is made of them."""
 
 import json
 from collections.abc import Collection, Sequence
@@ -36,6 +36,11 @@ class Source:
     def depth_keys(self) -> frozenset[str]:
         """Keys of the cameras declared as depth."""
         return frozenset(self.meta.depth_keys)
+
+    @property
+    def is_keyframed(self) -> bool:
+        """Whether rows are macro steps, as ``histmv keyframe`` writes them."""
+        return keys.SOURCE_FRAME in self.features
 
     def length(self, episode: int) -> int:
         """Frames of an episode."""
@@ -91,18 +96,26 @@ class Source:
 def open_source(
     repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None, revision: str | None = None
 ) -> Source:
-    """Dataset to keyframe; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
+    """Dataset to keyframe: ``open_dataset``, but not of one that is keyframed already, which is a ValueError too."""
+    source = open_dataset(repo_id, root, episodes, revision)
+    if source.is_keyframed:
+        raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
+    return source
+
+
+def open_dataset(
+    repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None, revision: str | None = None
+) -> Source:
+    """Dense or keyframed dataset; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
 
     Raises:
-        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, a dataset that is
-            keyframed already, or one that the Hub does not give.
+        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, or a dataset that
+            the Hub does not give.
     """
     if root is not None:
         check_files(Path(root))
     with hub.explained(repo_id):
         meta = LeRobotDatasetMetadata(repo_id, root, revision)
-    if keys.SOURCE_FRAME in meta.features:
-        raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
     chosen = tuple(range(meta.total_episodes)) if episodes is None else tuple(episodes)
     unknown = sorted(set(chosen) - set(range(meta.total_episodes)))
     if unknown or not chosen:

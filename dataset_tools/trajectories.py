@@ -108,15 +108,20 @@ def _one_later(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
 def _quaternion(column: Column, rotation_format: str, vectors: Vectors, episode: int) -> Float[np.ndarray, "n 4"]:
     """Canonical unit quaternions w, x, y, z."""
     values = column.of(vectors)
-    if rotation_format in ("rotvec", "rpy"):
-        turn = Rotation.from_rotvec(values) if rotation_format == "rotvec" else Rotation.from_euler("xyz", values)
-        return canonical(turn.as_quat(scalar_first=True))
-    norms = np.linalg.norm(values, axis=-1)
+    quaternions = wxyz(values, rotation_format)
+    norms = np.linalg.norm(quaternions, axis=-1)
     bad = np.flatnonzero(np.abs(norms - 1) >= UNIT_TOLERANCE)
     if len(bad):
         raise ValueError(
             f"episode {episode}, frame {bad[0]}: {column} is {values[bad[0]].tolist()}, a quaternion of norm "
             f"{norms[bad[0]]:.3g}; its norm must be 1"
         )
-    ordered = values if rotation_format == "wxyz" else values[:, [3, 0, 1, 2]]
-    return canonical(ordered / norms[:, None])
+    return canonical(quaternions / norms[:, None])
+
+
+def wxyz(values: Float[np.ndarray, "n d"], rotation_format: str) -> Float[np.ndarray, "n 4"]:
+    """Rotations of one of ``columns.ROTATION_FORMATS`` as w, x, y, z, norm and sign of quaternions as stored."""
+    if rotation_format in ("rotvec", "rpy"):
+        turn = Rotation.from_rotvec(values) if rotation_format == "rotvec" else Rotation.from_euler("xyz", values)
+        return turn.as_quat(scalar_first=True)
+    return values if rotation_format == "wxyz" else values[:, [3, 0, 1, 2]]

@@ -1,0 +1,379 @@
+"""``histmv doctor``: a healthy dataset passes without a finding; each way of breaking it gives exactly its finding.
+
+The healthy dataset is ray-cast (``helpers.scene``); ``BROKEN`` spoils a copy of it once per check.
+"""
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from helpers.episodes import edit_column, edit_info, vector_feature, write, write_vector_picks
+from helpers.scene import LENGTHS, RIG, STILL, Rig, episode, look_at, scene_features, write_scene
+from PIL import Image
+from rich.console import Console
+
+from dataset_tools.cli import main
+from dataset_tools.doctor import DoctorConfig, diagnose
+from dataset_tools.doctor_findings import CHECKS, Finding, Severity
+from dataset_tools.images import encode_rgb
+from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig
+from dataset_tools.keyframe import run as keyframe
+from lerobot_histmv import keys
+
+FRONT, FRONT_DEPTH = keys.rgb_key("front"), keys.depth_key("front")
+FRONT_POSE, WRIST_POSE = slice(0, 12), slice(24, 36)
+Spoil = Callable[[Path], Any]
+
+
+def look(root: Path, **options: Any) -> list[Finding]:
+    config = DoctorConfig(SourceConfig("test/scene", root), **options)
+    return list(diagnose(config, Console(quiet=True))[0].findings)
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene") / "dense")
+
+
+def numbers(feature: str, change: Callable[[np.ndarray], Any]) -> Spoil:
+    """Change a vector column, (rows, size), in place."""
+
+    def spoil(root: Path) -> None:
+        def edit(rows: list[Any]) -> None:
+            values = np.array(rows)
+            change(values)
+            rows[:] = values.tolist()
+
+        edit_column(root, feature, edit)
+
+    return spoil
+
+
+def tool(change: Callable[[np.ndarray], Any]) -> Spoil:
+    """Change state and action alike."""
+
+    def spoil(root: Path) -> None:
+        for feature in (keys.STATE, keys.ACTION):
+            numbers(feature, change)(root)
+
+    return spoil
+
+
+def pictures(key: str, change: Callable[[bytes], bytes], rows: slice = slice(None)) -> Spoil:
+    """Change stored image files of some rows."""
+
+    def edit(cells: list[Any]) -> None:
+        for cell in cells[rows]:
+            cell["bytes"] = change(cell["bytes"])
+
+    return lambda root: edit_column(root, key, edit)
+
+
+def depth(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    def stored(file: bytes) -> bytes:
+        return encoded(Image.fromarray(change(np.asarray(Image.open(io.BytesIO(file))))), "TIFF")
+
+    return pictures(FRONT_DEPTH, stored)
+
+
+def encoded(image: Image.Image, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, kind)
+    return buffer.getvalue()
+
+
+def feature(key: str, **changes: Any) -> Spoil:
+    return lambda root: edit_info(root, lambda info: info["features"][key].update(changes))
+
+
+def without(*features: str) -> Spoil:
+    return lambda root: edit_info(root, lambda info: [info["features"].pop(key) for key in features])
+
+
+def renamed(key: str, old: str, new: str) -> Spoil:
+    def change(info: dict[str, Any]) -> None:
+        info["features"][key]["names"] = [name.replace(old, new) for name in info["features"][key]["names"]]
+
+    return lambda root: edit_info(root, change)
+
+
+def again(make: Callable[[Path], Any]) -> Spoil:
+    """Write another dataset in place of the healthy one."""
+
+    def spoil(root: Path) -> None:
+        shutil.rmtree(root)
+        make(root)
+
+    return spoil
+
+
+def frames(*chosen: list[int]) -> Spoil:
+    """Episodes that consist of these frames of the same motion."""
+    motion = episode(RIG, 23, 2)
+    return again(lambda root: write(root, [[motion[i] for i in one] for one in chosen], scene_features()))
+
+
+def both(*spoils: Spoil) -> Spoil:
+    return lambda root: [spoil(root) for spoil in spoils]
+
+
+def data_file(root: Path) -> Path:
+    return root / "data/chunk-000/file-000.parquet"
+
+
+def cut_off(root: Path) -> None:
+    data_file(root).write_bytes(data_file(root).read_bytes()[:-99])
+
+
+def corrupt_pages(root: Path) -> None:
+    """Damage a page of the state, where the file's footer still is whole."""
+    column = next(
+        chunk
+        for i in range(pq.read_metadata(data_file(root)).row_group(0).num_columns)
+        if (chunk := pq.read_metadata(data_file(root)).row_group(0).column(i)).path_in_schema.startswith(keys.STATE)
+    )
+    content = bytearray(data_file(root).read_bytes())
+    begin = column.dictionary_page_offset or column.data_page_offset
+    content[begin : begin + 40] = b"\xff" * 40
+    data_file(root).write_bytes(content)
+
+
+def lose_row(root: Path) -> None:
+    table = pq.read_table(data_file(root))
+    pq.write_table(table.take([i for i in range(len(table)) if i != 5]), data_file(root))
+
+
+def lose_text(root: Path) -> None:
+    tasks = pd.read_parquet(root / "meta/tasks.parquet")
+    tasks.index = pd.Index([" "] * len(tasks), name=tasks.index.name)
+    tasks.to_parquet(root / "meta/tasks.parquet")
+
+
+def late(stamps: np.ndarray) -> None:
+    stamps[6 : LENGTHS[0]] += 0.3
+
+
+def flip_odd(values: np.ndarray) -> None:
+    values[1::2, 3:7] *= -1
+
+
+def as_xyzw(values: np.ndarray) -> None:
+    values[:, 3:7] = np.roll(values[:, 3:7], -1, axis=1)
+
+
+def hold(entries: slice) -> Callable[[np.ndarray], None]:
+    def change(values: np.ndarray) -> None:
+        values[:, entries] = values[0, entries]
+
+    return change
+
+
+def scaled(start: int, stop: int, factor: float) -> Callable[[np.ndarray], None]:
+    def change(values: np.ndarray) -> None:
+        values[:, start:stop] *= factor
+
+    return change
+
+
+def shifted(entry: int, by: float) -> Callable[[np.ndarray], None]:
+    def change(values: np.ndarray) -> None:
+        values[:, entry] += by
+
+    return change
+
+
+def spoilt_at(row: int, entry: int, value: float) -> Callable[[np.ndarray], None]:
+    def change(values: np.ndarray) -> None:
+        values[row, entry] = value
+
+    return change
+
+
+def nearly_blind(image: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(image.size).reshape(image.shape) % 50 == 0, image, 0).astype(image.dtype)
+
+
+def freeze(root: Path) -> None:
+    def edit(cells: list[Any]) -> None:
+        cells[1 : LENGTHS[0]] = [cells[0]] * (LENGTHS[0] - 1)
+
+    edit_column(root, FRONT, edit)
+
+
+def other_size(root: Path) -> None:
+    depth(lambda image: image[::2, ::2].copy())(root)
+    feature(FRONT_DEPTH, shape=[15, 19, 1])(root)
+
+
+def depth_video(root: Path) -> None:
+    rig = Rig(STILL, size=(64, 96))
+    features = scene_features(rig)
+    features[FRONT_DEPTH]["dtype"] = "video"
+    write(root, [episode(rig, 5, 0)], features)
+
+
+BLACK = encode_rgb(np.zeros((*RIG.size, 3), np.uint8))
+APART = Rig({"front": STILL["front"], "back": look_at((1.5, 0.5, 0.5), (2.2, 0.9, 0.0))}, moving="")
+NAMELESS = Rig({"front": STILL["front"], "side": STILL["side"]}, moving="third")
+METRES: dict[str, Any] = {"info": {"is_depth_map": True, "depth_unit": "m"}}
+
+BROKEN: list[tuple[str, Spoil]] = [
+    ("damaged", cut_off),
+    ("damaged", corrupt_pages),
+    ("damaged", lambda root: (root / "meta/info.json").write_text('{"fps": ')),
+    ("damaged", lambda root: edit_info(root, lambda info: info.update(codebase_version="v2.1"))),
+    ("rows", lose_row),
+    ("one_frame_episode", frames(list(range(11)), [20])),
+    ("instructions_missing", lose_text),
+    ("no_camera", again(write_vector_picks)),
+    ("depth_missing", without(FRONT_DEPTH)),
+    ("depth_picture", feature(FRONT_DEPTH, info=None)),
+    ("depth_video", again(depth_video)),
+    ("depth_size", other_size),
+    ("intrinsics_missing", without(keys.INTRINSICS)),
+    ("intrinsics_missing", renamed(keys.INTRINSICS, "front.", "camera_0.")),
+    ("extrinsics_missing", without(keys.EXTRINSICS)),
+    ("tool_pose_missing", feature(keys.STATE, names=list("abcdefgh"))),
+    ("tool_pose_missing", feature(keys.STATE, names=[*keys.POSITION_NAMES, *"abcd", keys.GRIPPER_NAME])),
+    ("action_pose_missing", renamed(keys.ACTION, "ee.", "delta_")),
+    ("nan", numbers(keys.STATE, spoilt_at(5, 1, np.nan))),
+    ("nan", numbers(keys.EXTRINSICS, spoilt_at(5, 1, np.inf))),
+    ("time_gap", numbers("timestamp", late)),
+    ("tool_jump", frames([*range(5), *range(17, 23)])),
+    ("duplicate_rows", frames([i - i % 2 for i in range(23)])),
+    ("duplicate_episode", frames(list(range(11)), list(range(12, 23)), list(range(11)))),
+    ("quaternion_norm", numbers(keys.STATE, scaled(3, 7, 0.9))),
+    ("quaternion_order", tool(as_xyzw)),
+    ("quaternion_sign", tool(flip_odd)),
+    ("action_not_reached", numbers(keys.ACTION, scaled(0, 3, 0.1))),
+    ("action_not_reached", numbers(keys.ACTION, lambda values: np.copyto(values[:, 3:7], [0, 1, 0, 0]))),
+    ("intrinsics_size", numbers(keys.INTRINSICS, scaled(0, 4, 5.0))),
+    ("extrinsics_rotation", numbers(keys.EXTRINSICS, lambda values: values.__imul__(1.1))),
+    ("extrinsics_constant", numbers(keys.EXTRINSICS, hold(WRIST_POSE))),
+    (
+        "extrinsics_constant",
+        both(again(lambda root: write_scene(root, NAMELESS, (11,))), numbers(keys.EXTRINSICS, hold(WRIST_POSE))),
+    ),
+    ("image_undecodable", pictures(FRONT, lambda file: file[: len(file) // 2], slice(0, 1))),
+    ("image_undecodable", pictures(FRONT_DEPTH, lambda file: b"no image", slice(0, 1))),
+    ("rgb_lossy", pictures(FRONT, lambda file: encoded(Image.open(io.BytesIO(file)), "JPEG"))),
+    ("image_blank", pictures(FRONT, lambda file: BLACK, slice(0, 1))),
+    ("image_frozen", freeze),
+    ("depth_unit", depth(lambda image: np.rint(image / 1000).astype(np.uint16))),
+    ("depth_unit", both(depth(lambda image: image.astype(np.float32)), feature(FRONT_DEPTH, **METRES))),
+    ("nan", depth(lambda image: np.where(np.arange(len(image))[:, None] < 3, np.nan, image).astype(np.float32))),
+    ("depth_invalid", depth(nearly_blind)),
+    ("tool_outside", tool(shifted(0, 2.0))),
+    ("tool_outside", tool(scaled(0, 3, 1000.0))),
+    ("views_disagree", numbers(keys.EXTRINSICS, shifted(11, 0.1))),
+    ("views_apart", again(lambda root: write_scene(root, APART, (11,)))),
+]
+
+
+def test_every_check_has_a_broken_dataset() -> None:
+    assert {check for check, _ in BROKEN} == set(CHECKS)
+
+
+def test_a_healthy_dataset_passes_without_a_finding(healthy: Path) -> None:
+    assert look(healthy) == []
+
+
+@pytest.mark.parametrize(("check", "spoil"), BROKEN, ids=[f"{check}-{i}" for i, (check, _) in enumerate(BROKEN)])
+def test_each_break_gives_exactly_its_finding(check: str, spoil: Spoil, healthy: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(healthy, tmp_path / "dense")
+    spoil(root)
+    found = look(root)
+    assert {finding.check for finding in found} == {check}, found
+    assert {finding.severity for finding in found} == {CHECKS[check].severity}
+
+
+def test_a_keyframed_dataset_is_judged_as_one(healthy: Path, tmp_path: Path) -> None:
+    root = tmp_path / "keys"
+    keyframe(KeyframeConfig(SourceConfig("test/scene", healthy), OutputConfig("test/keys", root), method="exact"))
+    assert look(root) == []
+    numbers(keys.ACTION, shifted(2, 0.1))(root)
+    assert {finding.check for finding in look(root)} == {"action_not_reached"}
+
+
+def test_a_finding_names_episode_frame_camera_value_and_remedy(healthy: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(healthy, tmp_path / "dense")
+    numbers(keys.STATE, spoilt_at(LENGTHS[0] + 7, 2, np.nan))(root)
+    pictures(FRONT, lambda file: BLACK, slice(0, 1))(root)
+    found = {finding.check: finding for finding in look(root)}
+    assert (found["nan"].episode, found["nan"].frame) == (1, 7)
+    assert "observation.state[ee.z.pos] is nan" in found["nan"].message
+    blank = found["image_blank"]
+    assert (blank.episode, blank.frame, blank.camera) == (0, 0, "front")
+    assert blank.remedy == CHECKS["image_blank"].remedy
+
+
+ARM = ("waist", "elbow", "gripper")
+
+
+def foreign(root: Path) -> Path:
+    """One unnamed camera and joint angles: nothing of what our policy needs."""
+    features = {
+        "observation.image": {"dtype": "image", "shape": (17, 19, 3), "names": ["height", "width", "channels"]},
+        keys.STATE: vector_feature(ARM),
+        keys.ACTION: {"dtype": "float32", "shape": (3,), "names": None},
+    }
+    rng = np.random.default_rng(0)
+    rows = [
+        {
+            "observation.image": rng.integers(0, 256, (17, 19, 3), np.uint8),
+            keys.STATE: np.float32([i, 2 * i, 0]),
+            keys.ACTION: np.float32([i, 0, 1]),
+        }
+        for i in range(7)
+    ]
+    return write(root, [rows], features, paraphrases=False)
+
+
+def test_a_foreign_dataset_is_told_what_the_policy_misses_and_is_fine_for_others(tmp_path: Path) -> None:
+    root = foreign(tmp_path / "dense")
+    missing = {"depth_missing", "intrinsics_missing", "extrinsics_missing", "tool_pose_missing"}
+    assert {finding.check: finding.severity for finding in look(root)} == dict.fromkeys(missing, Severity.ERROR)
+    assert {f.check: f.severity for f in look(root, policy="any")} == dict.fromkeys(missing, Severity.NOTE)
+
+
+def doctor(root: Path, *options: str) -> int:
+    """Exit code of the command."""
+    try:
+        main(["doctor", "--dataset.repo_id=test/scene", f"--dataset.root={root}", *options])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_the_exit_code_tells_errors_and_json_tells_all(
+    healthy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, told = shutil.copytree(healthy, tmp_path / "dense"), tmp_path / "told/findings.json"
+    assert doctor(root) == 0
+    assert "healthy: nothing found in 3 episodes" in capsys.readouterr().out
+    tool(flip_odd)(root)
+    assert doctor(root) == 0
+    assert "ready for training: 6 warnings" in capsys.readouterr().out
+    numbers("timestamp", late)(root)
+    assert doctor(root, f"--json={told}") == 1
+    out = capsys.readouterr().out
+    assert "not ready for training: 1 error, 6 warnings" in out
+    assert "time_gap" in out
+    content = json.loads(told.read_text())
+    assert content["counts"] == {"error": 1, "warning": 6, "note": 0}
+    gap = next(finding for finding in content["findings"] if finding["severity"] == "error")
+    assert (gap["check"], gap["episode"], gap["frame"]) == ("time_gap", 0, 5)
+    assert gap["remedy"] == CHECKS["time_gap"].remedy
+
+
+def test_the_manual_explains_every_check() -> None:
+    manual = (Path(__file__).parents[2] / "docs/doctor.md").read_text()
+    for name, check in CHECKS.items():
+        assert f"| `{name}` | {check.severity} |" in manual, name
