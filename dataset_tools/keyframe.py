@@ -52,21 +52,10 @@ class OutputConfig:
     private: bool = False
 
 
-@dataclass
-class KeyframeConfig:
-    """Keep the key poses of each episode: one row per macro step, with the next key pose as the action.
+@dataclass(kw_only=True)
+class KeyframingConfig:
+    """Which frames of an episode are its keyframes: the same options wherever a dense dataset is keyframed."""
 
-    Always kept are the first and last frame, pauses and gripper changes; between them the method adds the fewest poses
-    such that straight lines between key poses stay within epsilon of the recorded path on average.
-
-        histmv keyframe --dataset.repo_id=me/demos --dataset.root=demos --output.repo_id=me/keys --output.root=keys
-
-    Any LeRobot dataset works; where the tool position, rotation and gripper cannot be guessed from the feature names,
-    tell them: --columns.position=observation.state:0:3 --columns.gripper=action:6
-    """
-
-    dataset: SourceConfig
-    output: OutputConfig
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
     # ga (genetic), exact (dynamic program), heuristic (pauses and gripper only), rdp, awe (fewest under a largest
     # error) or uniform (evenly in time).
@@ -85,11 +74,6 @@ class KeyframeConfig:
     pause: PauseOptions = field(default_factory=PauseOptions)
     # Settings of the genetic algorithm.
     genetic: GeneticOptions = field(default_factory=GeneticOptions)
-    # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
-    # which fail) or drop (leave those out).
-    replay: Literal["off", "flag", "drop"] = "off"
-    # Replace an existing output dataset.
-    overwrite: bool = False
 
     def options(self) -> KeyframeOptions:
         """The part that decides which frames are kept."""
@@ -103,6 +87,28 @@ class KeyframeConfig:
             pause=self.pause,
             genetic=self.genetic,
         )
+
+
+@dataclass
+class KeyframeConfig(KeyframingConfig):
+    """Keep the key poses of each episode: one row per macro step, with the next key pose as the action.
+
+    Always kept are the first and last frame, pauses and gripper changes; between them the method adds the fewest poses
+    such that straight lines between key poses stay within epsilon of the recorded path on average.
+
+        histmv keyframe --dataset.repo_id=me/demos --dataset.root=demos --output.repo_id=me/keys --output.root=keys
+
+    Any LeRobot dataset works; where the tool position, rotation and gripper cannot be guessed from the feature names,
+    tell them: --columns.position=observation.state:0:3 --columns.gripper=action:6
+    """
+
+    dataset: SourceConfig
+    output: OutputConfig
+    # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
+    # which fail) or drop (leave those out).
+    replay: Literal["off", "flag", "drop"] = "off"
+    # Replace an existing output dataset.
+    overwrite: bool = False
 
 
 def run(config: KeyframeConfig) -> None:

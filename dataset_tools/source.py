@@ -1,4 +1,4 @@
-"""Reading the episodes that are to be keyframed: any LeRobot v3 dataset, checked before anything is written."""
+"""Reading the episodes of a dataset: any LeRobot v3 dataset, checked before anything is written."""
 
 import json
 from collections.abc import Sequence
@@ -35,6 +35,11 @@ class Source:
     def depth_keys(self) -> frozenset[str]:
         """Keys of the cameras declared as depth."""
         return frozenset(self.meta.depth_keys)
+
+    @property
+    def is_keyframed(self) -> bool:
+        """Whether its rows are macro steps rather than frames."""
+        return keys.SOURCE_FRAME in self.features
 
     def length(self, episode: int) -> int:
         """Frames of an episode."""
@@ -103,18 +108,40 @@ class Source:
 def open_source(
     repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None, revision: str | None = None
 ) -> Source:
-    """Dataset to keyframe; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
+    """Dataset to keyframe: one of ``open_dataset`` that is not keyframed already.
 
     Raises:
-        ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, or a dataset that
-            is keyframed already.
+        ValueError: also if it is keyframed.
+    """
+    source = open_dataset(repo_id, root, episodes, revision)
+    if source.is_keyframed:
+        raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
+    return source
+
+
+def open_dataset(
+    repo_id: str,
+    root: str | Path | None = None,
+    episodes: Sequence[int] | None = None,
+    revision: str | None = None,
+    most: int | None = None,
+) -> Source:
+    """Any LeRobot dataset; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
+
+    Args:
+        repo_id: its name.
+        root: folder that holds it.
+        episodes: those to read.
+        revision: branch, tag or commit on the Hub.
+        most: without ``episodes``, how many to take from the start; all by default.
+
+    Raises:
+        ValueError: no dataset at ``root``, damaged or missing files, or an episode that does not exist.
     """
     if root is not None:
         _check_files(Path(root))
     meta = LeRobotDatasetMetadata(repo_id, root, revision)
-    if keys.SOURCE_FRAME in meta.features:
-        raise ValueError(f"{repo_id} is keyframed already (it has the column {keys.SOURCE_FRAME}); give the dense one")
-    chosen = tuple(range(meta.total_episodes)) if episodes is None else tuple(episodes)
+    chosen = tuple(range(meta.total_episodes)[:most] if episodes is None else episodes)
     unknown = sorted(set(chosen) - set(range(meta.total_episodes)))
     if unknown or not chosen:
         raise ValueError(
