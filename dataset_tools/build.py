@@ -7,6 +7,7 @@ pose and gripper command of keyframe i + 1. The dataset appears under its name o
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -172,19 +173,37 @@ def _cells(column: Any, kind: pa.DataType) -> pa.Array:
     return pa.array(values, kind)
 
 
+@dataclass(frozen=True)
+class Kind:
+    """A kind of folder that is written as a whole.
+
+    Args:
+        mark: a file that every such folder has; others are never replaced.
+        name: what it is, for messages.
+        option: the option that says where it goes.
+    """
+
+    mark: str
+    name: str
+    option: str
+
+
+DATASET = Kind("meta/info.json", "LeRobot dataset", "--output.root")
+
+
 @contextmanager
-def published(root: Path, overwrite: bool) -> Iterator[Path]:
-    """A path to write a dataset to, which becomes ``root`` when the block ends without an error.
+def published(root: Path, overwrite: bool, kind: Kind = DATASET) -> Iterator[Path]:
+    """A path to write a folder to, which becomes ``root`` when the block ends without an error.
 
     Until then ``root`` keeps what it holds; what an interrupted run left beside it is cleared away.
 
     Raises:
-        ValueError: ``root`` exists and ``overwrite`` is not set, or it holds something that is no LeRobot dataset.
+        ValueError: ``root`` exists and ``overwrite`` is not set, or it holds something that is not of this ``kind``.
     """
     partial, old = (root.with_name(f".{root.name}.{what}") for what in ("partial", "old"))
     if old.exists() and not root.exists():
         old.rename(root)
-    check_free(root, overwrite)
+    check_free(root, overwrite, kind)
     root.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -198,14 +217,14 @@ def published(root: Path, overwrite: bool) -> Iterator[Path]:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def check_free(root: Path, overwrite: bool) -> None:
-    """ValueError if a dataset cannot be written to ``root``."""
+def check_free(root: Path, overwrite: bool, kind: Kind = DATASET) -> None:
+    """ValueError if a folder of this ``kind`` cannot be written to ``root``."""
     if not root.exists() or (root.is_dir() and not any(root.iterdir())):
         return
-    if not (root / "meta/info.json").is_file():
-        raise ValueError(f"{root} exists and is no LeRobot dataset; give another --output.root")
+    if not (root / kind.mark).is_file():
+        raise ValueError(f"{root} exists and is no {kind.name}; give another {kind.option}")
     if not overwrite:
-        raise ValueError(f"{root} holds a dataset; give another --output.root, or --overwrite=true to replace it")
+        raise ValueError(f"{root} holds a {kind.name}; give another {kind.option}, or --overwrite=true to replace it")
 
 
 def default_root(repo_id: str) -> Path:

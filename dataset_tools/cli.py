@@ -32,6 +32,7 @@ COMMANDS = {
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
+    "inspect": Command("dataset_tools.inspection", "draw episodes: path, keyframes, errors, tool in every view, cloud"),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),
     "report": Command("dataset_tools.demo_report", "the one-page report of a demo directory, written again"),

@@ -1,11 +1,12 @@
 """One look for all pictures of keyframes: a colour and a marker per reason, so that no legend need be learnt twice."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import matplotlib.patheffects
 import numpy as np
 from jaxtyping import Float
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -44,6 +45,13 @@ def look(reason: str) -> Look:
 def new_figure(height: float) -> Figure:
     """An empty figure of the common width, ``height`` inches high."""
     return Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
+    """One legend for the whole figure, under it."""
+    rows = -(-len(handles) // 6)
+    columns = -(-len(handles) // rows)
+    figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
 
 
 def reason_handles(reasons: Iterable[str]) -> list[Line2D]:

@@ -1,5 +1,6 @@
 """Picture of the merged cloud of all views, in its own colours and coloured by the view each point comes from."""
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,15 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from dataset_tools.figure_style import INK, look, new_figure, reason_handles
+from dataset_tools.figure_style import INK, legend_below, look, new_figure, reason_handles
 from dataset_tools.inspect_cameras import Cloud, merged_cloud
 from dataset_tools.inspect_episodes import Episode
 
 AROUND = 0.25
 """How far around the key poses the cloud is shown [m]."""
 MOST_POINTS = 40_000
-CAMERA_COLORS = ("#1c7ed6", "#e8590c", "#2f9e44", "#9c36b5", "#f59f00", "#0b7285")
+CAMERA_COLORS = ("#82c91e", "#3bc9db", "#f783ac", "#fcc419", "#868e96", "#a47551")
+"""Other colours than those of the reasons."""
 ELEVATION, AZIMUTH = 28.0, 35.0
 """From where the cloud is seen [degrees]."""
 
@@ -36,15 +38,15 @@ def draw_cloud(episode: Episode) -> Figure:
     for column, (colors, title) in enumerate(pictures):
         axes = figure.add_subplot(1, 2, column + 1, projection="3d")
         _scatter(axes, cloud.points[shown], colors[shown])
-        axes.set_title(title, fontsize=10, color=INK)
+        axes.text2D(0.5, 0.97, title, transform=axes.transAxes, ha="center", fontsize=10, color=INK)
         if not episode.is_joints:
             _draw_route(axes, episode, route)
     handles = [
-        Line2D([], [], color=color, marker="o", linestyle="", label=camera)
-        for camera, color in zip(cloud.cameras, CAMERA_COLORS, strict=False)
+        Line2D([], [], color=color, marker="s", markersize=9, linestyle="", label=f"seen by {camera}")
+        for camera, color in zip(cloud.cameras, cycle(CAMERA_COLORS), strict=False)
     ]
     handles += [] if episode.is_joints else reason_handles(pose.reason for pose in episode.poses)
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
+    legend_below(figure, handles)
     return figure
 
 

@@ -86,7 +86,7 @@ def keyframed_episodes(
     for number in source.episodes:
         vectors = source.vectors(number)
         rows = source.table(number, PROVENANCE)
-        origin, seen = _numbers(rows, keys.SOURCE_EPISODE)[0], _numbers(rows, keys.SOURCE_FRAME)
+        origin, seen = origin_of(source, number), _numbers(rows, keys.SOURCE_FRAME)
         made = making.keyframes.get(origin, ()) if making else ()
         known = [keyframe.observation_frame for keyframe in made[:-1]] == seen
         recorded = dense.get(origin) if known else None
@@ -103,6 +103,12 @@ def keyframed_episodes(
             is_joints=columns.is_joints,
             notes=[*([] if known else [UNKNOWN]), *([] if motion else [NO_PATH])],
         )
+
+
+def origin_of(source: Source, number: int) -> int:
+    """Episode of the dense dataset that an episode was made of."""
+    check_provenance(source)
+    return int(_numbers(source.table(number, [keys.SOURCE_EPISODE], [0]), keys.SOURCE_EPISODE)[0])
 
 
 def check_provenance(source: Source) -> None:

@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
-from dataset_tools.figure_style import FAINT, HALO, INK, look, new_figure, reason_handles, shared_labels
+from dataset_tools.figure_style import FAINT, HALO, INK, legend_below, look, new_figure, reason_handles, shared_labels
 from dataset_tools.inspect_episodes import Episode, KeyPose, Motion
 
 CLOSED, CLOSED_LABEL = "#f59f00", "gripper told to be closed"
@@ -18,8 +19,10 @@ STRAIGHT = "#74a9e0"
 """The straight lines between keyframes."""
 ELEVATION, AZIMUTH = 22.0, -58.0
 """From where the path is seen in space [degrees]."""
-MARGIN = 0.08
+MARGIN = 0.1
 """Room around the path, as a share of its largest extent."""
+THINNEST = 0.4
+"""Least side of the drawn box, as a share of its largest."""
 SAME_PLACE = 0.035
 """Keyframes closer than this share of the path's largest extent are numbered together."""
 
@@ -39,7 +42,7 @@ def draw_trajectory(episode: Episode) -> Figure:
         axes.margins(MARGIN)
         axes.grid(alpha=0.3)
     handles = [*_path_handles(episode), *reason_handles(pose.reason for pose in episode.poses)]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), fontsize=9, frameon=False)
+    legend_below(figure, handles)
     return figure
 
 
@@ -77,10 +80,13 @@ def _stand_on_floor(space: Any, episode: Episode) -> None:
     points = key_positions(episode)
     everything = np.vstack([points, *([episode.motion.trajectory.position] if episode.motion else [])])
     room = MARGIN * _extent(episode)
-    low, high = everything.min(0) - room, everything.max(0) + room
-    for name, limits in zip("xyz", zip(low, high, strict=True), strict=True):
-        getattr(space, f"set_{name}lim")(*limits)
-    space.set_box_aspect(high - low, zoom=1.0)
+    middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0) / 2 + room
+    half = np.maximum(half, THINNEST * half.max())
+    low, high = middle - half, middle + half
+    for name, begin, end in zip("xyz", low, high, strict=True):
+        getattr(space, f"set_{name}lim")(begin, end)
+        getattr(space, f"{name}axis").set_major_locator(MaxNLocator(max(2, round(6 * (end - begin) / half.max() / 2))))
+    space.set_box_aspect(high - low)
     floor = np.full(len(everything), low[2])
     path = everything[len(points) :] if episode.motion else points
     space.plot(path[:, 0], path[:, 1], floor[: len(path)], color=FAINT, linewidth=1, zorder=1)
@@ -138,7 +144,9 @@ def draw_errors(episode: Episode) -> Figure:
     error.set_ylim(bottom=0)
     steps = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=-1) * trajectory.fps
     speed.plot(seconds[1:] - 0.5 / trajectory.fps, steps, color=INK, linewidth=1.2)
-    speed.axhline(options.pause.speed, color=look("pause").color, linewidth=1, linestyle="--", label="still below this")
+    speed.axhline(
+        options.pause.speed, color=look("pause").color, linewidth=1, linestyle="--", label="slower counts as still"
+    )
     speed.set_ylabel(f"speed [{episode.unit}/s]", fontsize=9)
     speed.set_xlabel(f"time [s]; frames at {trajectory.fps:g} Hz", fontsize=9)
     strip = speed.get_xaxis_transform()
@@ -150,10 +158,9 @@ def draw_errors(episode: Episode) -> Figure:
         axes.tick_params(labelsize=8)
         axes.margins(x=0.01)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
     _number_keyframes(error, motion)
-    handles = reason_handles(pose.reason for pose in episode.poses)
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
+    handles = [line for axes in (error, speed) for line in axes.get_legend_handles_labels()[0]]
+    legend_below(figure, [*handles, *reason_handles(pose.reason for pose in episode.poses)])
     return figure
 
 

@@ -6,7 +6,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from dataset_tools.figure_style import AXIS_COLORS, HALO, INK, WIDTH, look, new_figure, reason_handles, shared_labels
+from dataset_tools.figure_style import (
+    AXIS_COLORS,
+    HALO,
+    INK,
+    WIDTH,
+    legend_below,
+    look,
+    new_figure,
+    reason_handles,
+    shared_labels,
+)
 from dataset_tools.inspect_cameras import CameraView
 from dataset_tools.inspect_episodes import Episode, Observation
 from lerobot_histmv.geometry import matrix_from_quaternion, project
@@ -47,7 +57,7 @@ def draw_projections(episode: Episode) -> Figure:
         axes.set_title(camera, fontsize=10, color=INK)
     triad = [Line2D([], [], color=color, linewidth=3, label=f"tool {name}") for name, color in AXIS_COLORS.items()]
     handles = [*triad, *reason_handles(pose.reason for pose in episode.poses[1:])]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
+    legend_below(figure, handles)
     return figure
 
 

@@ -170,7 +170,7 @@ def test_what_a_killed_run_left_behind_is_cleared_or_put_back(tmp_path: Path) ->
     (old / "meta/info.json").write_text("{}")
     partial.mkdir()
     (partial / "half").write_text("")
-    with pytest.raises(ValueError, match="holds a dataset"), build.published(root, overwrite=False):
+    with pytest.raises(ValueError, match="holds a LeRobot dataset"), build.published(root, overwrite=False):
         pass
     assert (root / "meta/info.json").is_file()
     with build.published(root, overwrite=True) as path:
