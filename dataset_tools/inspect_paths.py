@@ -39,7 +39,7 @@ def draw_trajectory(episode: Episode) -> Figure:
         _draw_path(axes, episode, order)
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(MARGIN)
+        axes.margins(x=2 * MARGIN, y=MARGIN)
         axes.grid(alpha=0.3)
     handles = [*_path_handles(episode), *reason_handles(pose.reason for pose in episode.poses)]
     legend_below(figure, handles)
@@ -151,7 +151,7 @@ def draw_errors(episode: Episode) -> Figure:
     speed.set_xlabel(f"time [s]; frames at {trajectory.fps:g} Hz", fontsize=9)
     strip = speed.get_xaxis_transform()
     speed.fill_between(
-        seconds, 0, 0.06, where=_closed(motion).tolist(), transform=strip, color=CLOSED, label=CLOSED_LABEL
+        seconds, 0.94, 1, where=_closed(motion).tolist(), transform=strip, color=CLOSED, label=CLOSED_LABEL
     )
     for axes in (error, speed):
         _mark_keyframes(axes, motion, episode.poses)

@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from dataset_tools import build
 from dataset_tools.demonstrations import read_demonstrations
+from dataset_tools.figure_style import DPI
 from dataset_tools.inspect_dense import dense_episodes
 from dataset_tools.inspect_episodes import Episode
 from dataset_tools.inspect_keyframed import Making, keyframed_episodes, origin_of, read_making
@@ -101,7 +102,7 @@ def draw_episode(episode: Episode, folder: Path) -> Chapter:
     for panel in PANELS:
         if not panel.lacking(episode):
             pictures[panel.name] = folder / f"{stem(episode)}_{panel.name}.png"
-            panel.draw(episode).savefig(pictures[panel.name])
+            panel.draw(episode).savefig(pictures[panel.name], dpi=DPI)
     return Chapter.of(episode, [*episode.notes, *left_out(episode)], pictures)
 
 
