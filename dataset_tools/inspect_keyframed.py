@@ -93,7 +93,8 @@ def keyframed_episodes(
         if recorded is not None and len(recorded) <= made[-1].observation_frame:
             recorded = None
         motion = Motion.of(recorded, made, making.options) if recorded is not None and making else None
-        measured = trajectory_of(vectors, columns, gripper_ends(columns, {number: vectors}), source.meta.fps, number)
+        ends, fps = gripper_ends(columns, {number: vectors}), float(source.meta.fps)
+        measured = trajectory_of(vectors, columns, ends, fps, number)
         yield Episode(
             number=number,
             instruction=instruction_of(source, number),
@@ -132,7 +133,7 @@ def _poses(
 ) -> list[KeyPose]:
     """The first key pose as it was measured, the others as the rows' actions."""
     names = entry_names(source.features[keys.ACTION])
-    frames = list(made) or [None] * len(reasons)
+    frames: Sequence[Keyframe | None] = made or [None] * len(reasons)
     first = KeyPose(
         reason=reasons[0],
         position=measured.position[0],

@@ -74,8 +74,8 @@ def draw_projection(axes: Axes, view: CameraView, episode: Episode, row: int) ->
     for pixel, pose in zip(pixels[1:], following, strict=True):
         style = look(pose.reason)
         axes.plot(*pixel, marker=style.marker, color=style.color, markersize=7, markeredgecolor="white")
-    for place, text in shared_labels(pixels[1:], SAME_PLACE * width, first=row + 1):
-        axes.annotate(text, place, (6, 4), textcoords="offset points", fontsize=8, path_effects=HALO, clip_on=True)
+    for (u, v), text in shared_labels(pixels[1:], SAME_PLACE * width, first=row + 1):
+        axes.annotate(text, (u, v), (6, 4), textcoords="offset points", fontsize=8, path_effects=HALO, clip_on=True)
     triad, _ = project(tool_triad(observation), view.intrinsics, view.world_from_cam)
     for line, color in zip(triad, AXIS_COLORS.values(), strict=False):
         axes.plot(*line.T, color=color, linewidth=3, solid_capstyle="round")
