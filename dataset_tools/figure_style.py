@@ -13,6 +13,8 @@ from matplotlib.lines import Line2D
 WIDTH = 10.0
 """Width of a figure [inches]; with ``DPI`` 1,200 pixels."""
 DPI = 120
+LETTERS = 150
+"""How many letters of a legend fit beside each other."""
 INK, FAINT = "#343a40", "#adb5bd"
 AXIS_COLORS = {"x": "#e03131", "y": "#2f9e44", "z": "#1971c2"}
 HALO = [matplotlib.patheffects.withStroke(linewidth=2.5, foreground="white")]
@@ -49,8 +51,8 @@ def new_figure(height: float) -> Figure:
 
 def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
     """One legend for the whole figure, under it."""
-    rows = -(-len(handles) // 6)
-    columns = -(-len(handles) // rows)
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    columns = min(len(handles), max(1, LETTERS // (longest + 6)))
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
 
 
