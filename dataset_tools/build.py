@@ -4,9 +4,7 @@ Of an episode's k keyframes, row i holds what was seen at keyframe i (its observ
 pose and gripper command of keyframe i + 1.
 """
 
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -132,42 +130,6 @@ def _cells(column: Any, feature: Mapping[str, Any], kind: pa.DataType) -> pa.Arr
     if isinstance(kind, pa.BaseExtensionType):
         return pa.ExtensionArray.from_storage(kind, pa.array(values, kind.storage_type))
     return pa.array(values, kind)
-
-
-@contextmanager
-def published(root: Path, overwrite: bool) -> Iterator[Path]:
-    """A path to write a dataset to, which becomes ``root`` when the block ends without an error.
-
-    Until then ``root`` keeps what it holds; what an interrupted run left beside it is cleared away.
-
-    Raises:
-        ValueError: ``root`` exists and ``overwrite`` is not set, or it holds something that is no LeRobot dataset.
-    """
-    partial, old = (root.with_name(f".{root.name}.{what}") for what in ("partial", "old"))
-    if old.exists() and not root.exists():
-        old.rename(root)
-    check_free(root, overwrite)
-    root.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        yield partial
-        if root.exists():
-            root.rename(old)
-        partial.rename(root)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        if root.exists():
-            shutil.rmtree(old, ignore_errors=True)
-
-
-def check_free(root: Path, overwrite: bool) -> None:
-    """ValueError if a dataset cannot be written to ``root``."""
-    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
-        return
-    if not (root / "meta/info.json").is_file():
-        raise ValueError(f"{root} exists and is no LeRobot dataset; give another --output.root")
-    if not overwrite:
-        raise ValueError(f"{root} holds a dataset; give another --output.root, or --overwrite=true to replace it")
 
 
 def default_root(repo_id: str) -> Path:

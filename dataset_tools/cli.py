@@ -31,16 +31,21 @@ COMMANDS = {
     "record": Command(
         "dataset_tools.record", "let the scripted experts demonstrate a task and write a LeRobot dataset"
     ),
-    "convert": Command("dataset_tools.convert", "episodes of RLBench's or robomimic's format as a LeRobot dataset"),
+    "convert": Command(
+        "dataset_tools.convert.command", "episodes of RLBench's or robomimic's format as a LeRobot dataset"
+    ),
     "calibrate-attach": Command(
-        "dataset_tools.calibrate_attach", "add camera calibrations from a YAML file to a LeRobot dataset"
+        "dataset_tools.calibrate.command", "add camera calibrations from a YAML file to a LeRobot dataset"
     ),
     "doctor": Command(
-        "dataset_tools.doctor", "what is wrong with a LeRobot dataset, and how to mend it, before training"
+        "dataset_tools.doctor.command", "what is wrong with a LeRobot dataset, and how to mend it, before training"
     ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
-    "push": Command("dataset_tools.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),
+    "push": Command("dataset_tools.hub.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),
+    "inspect": Command(
+        "dataset_tools.inspect.command", "draw episodes: path, keyframes, errors, tool in every view, cloud"
+    ),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),
     "report": Command("dataset_tools.demo_report", "the one-page report of a demo directory, written again"),

@@ -14,6 +14,7 @@ from jaxtyping import UInt8, UInt16
 from matplotlib.figure import Figure
 from PIL import Image
 
+from dataset_tools.figure_style import look
 from lerobot_histmv import keys
 
 LOG_FREQUENCY = re.compile(r"'log_freq': (\d+)")
@@ -137,8 +138,8 @@ def depth_range(keyframes: list[Keyframe], camera: str) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def draw_contact_sheet(keyframes: list[Keyframe], path: Path) -> None:
-    """Write one episode as a picture: a row per macro step, colours and depth of each camera side by side."""
+def contact_sheet(keyframes: list[Keyframe]) -> Figure:
+    """One episode as a picture: a row per keyframe, colours and depth of each camera side by side."""
     panels = [
         (camera, kind)
         for camera, pair in keyframes[0].pictures.items()
@@ -155,7 +156,13 @@ def draw_contact_sheet(keyframes: list[Keyframe], path: Path) -> None:
             pixels = frame.pictures[camera][is_depth]
             axes.imshow(np.ma.masked_equal(pixels, 0) if is_depth else pixels, vmin=low, vmax=high)
             axes.set(xticks=[], yticks=[])
-    for frame, axes in zip(keyframes, grid[:, 0], strict=True):
-        axes.set_ylabel(f"{frame.reason}\n{frame.seconds:.2f} s", fontsize=9)
+    for number, (frame, axes) in enumerate(zip(keyframes, grid[:, 0], strict=True)):
+        label = f"{number}: {frame.reason}\n{frame.seconds:.2f} s"
+        axes.set_ylabel(label, fontsize=9, color=look(frame.reason).color)
     figure.suptitle(f"“{keyframes[0].instruction}”", fontsize=11)
-    figure.savefig(path, dpi=110)
+    return figure
+
+
+def draw_contact_sheet(keyframes: list[Keyframe], path: Path) -> None:
+    """Write the contact sheet of one episode."""
+    contact_sheet(keyframes).savefig(path, dpi=110)

@@ -26,6 +26,15 @@ class Demonstrations:
     columns: Columns
     ends: GripperEnds
 
+    def trajectory(self, episode: int) -> Trajectory:
+        """Tool motion of one episode.
+
+        Raises:
+            ValueError: see ``Source.vectors`` and ``trajectories``.
+        """
+        vectors, fps = self.source.vectors(episode), float(self.source.meta.fps)
+        return trajectory_of(vectors, self.columns, self.ends, fps, episode)
+
     def notices(self) -> list[str]:
         """Sentences about what is missing, assumed or dropped."""
         return [*self._missing(), *self._assumed(), *self._dropped()]
@@ -96,12 +105,3 @@ def gripper_ends(source: Source, columns: Columns) -> GripperEnds:
         ranges.append((float(values.min()), float(values.max())))
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     return (low, high) if low < high else (low - 1, high)
-
-
-def trajectory(source: Source, columns: Columns, ends: GripperEnds, episode: int) -> Trajectory:
-    """Tool motion of one episode.
-
-    Raises:
-        ValueError: see ``Source.vectors`` and ``trajectories``.
-    """
-    return trajectory_of(source.vectors(episode), columns, ends, float(source.meta.fps), episode)

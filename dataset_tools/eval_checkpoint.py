@@ -23,7 +23,7 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from dataset_tools import hub
+from dataset_tools.hub import repositories
 from lerobot_histmv import _plugin  # noqa: F401  (registers the policy, its processors and the environments)
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
@@ -60,7 +60,7 @@ def checkpoint_folder(path: str) -> Path:
         raise ValueError(f"{path} is no checkpoint: it lacks {CONFIG} or {WEIGHTS}{hint}")
     if path.count("/") != 1 or path.startswith((".", "/", "~")):
         raise ValueError(f"there is no folder {path}; a checkpoint is a folder with {CONFIG} and {WEIGHTS}")
-    with hub.explained(path):
+    with repositories.explained(path):
         return Path(snapshot_download(path))
 
 

@@ -9,15 +9,16 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
-from dataset_tools import build, hub, keyframe_shards
+from dataset_tools import build, keyframe_shards
 from dataset_tools.columns import ColumnsConfig
 from dataset_tools.demonstrations import understand
 from dataset_tools.fitness import Distance
 from dataset_tools.genetic import GeneticOptions
+from dataset_tools.hub import repositories
+from dataset_tools.hub.push import push_dataset
 from dataset_tools.keyframe_shards import Keyframed, finished_episodes
 from dataset_tools.keyframe_worker import KeyframeJob, keyframe_missing
 from dataset_tools.keyframes import MOST, KeyframeOptions
-from dataset_tools.push import push_dataset
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.replay import read_scenes
 from dataset_tools.report import Report
@@ -57,21 +58,10 @@ class OutputConfig:
     license: str | None = None
 
 
-@dataclass
-class KeyframeConfig:
-    """Keep the key poses of each episode: one row per macro step, with the next key pose as the action.
+@dataclass(kw_only=True)
+class KeyframingConfig:
+    """Which frames of an episode are its keyframes: the same options wherever a dense dataset is keyframed."""
 
-    Always kept are the first and last frame, pauses and gripper changes; between them the method adds the fewest poses
-    such that straight lines between key poses stay within epsilon of the recorded path on average.
-
-        histmv keyframe --dataset.repo_id=me/demos --dataset.root=demos --output.repo_id=me/keys --output.root=keys
-
-    Any LeRobot dataset works; where the tool position, rotation and gripper cannot be guessed from the feature names,
-    tell them: --columns.position=observation.state:0:3 --columns.gripper=action:6
-    """
-
-    dataset: SourceConfig
-    output: OutputConfig
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
     # ga (genetic), exact (dynamic program), heuristic (pauses and gripper only), rdp, awe (fewest under a largest
     # error) or uniform (evenly in time).
@@ -94,13 +84,6 @@ class KeyframeConfig:
     pause: PauseOptions = field(default_factory=PauseOptions)
     # Settings of the genetic algorithm.
     genetic: GeneticOptions = field(default_factory=GeneticOptions)
-    # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
-    # which fail) or drop (leave those out).
-    replay: Literal["off", "flag", "drop"] = "off"
-    # Processes; the result does not depend on their number.
-    workers: int = 2
-    # Replace an existing output dataset.
-    overwrite: bool = False
 
     def options(self) -> KeyframeOptions:
         """The part that decides which frames are kept."""
@@ -115,6 +98,30 @@ class KeyframeConfig:
             pause=self.pause,
             genetic=self.genetic,
         )
+
+
+@dataclass
+class KeyframeConfig(KeyframingConfig):
+    """Keep the key poses of each episode: one row per macro step, with the next key pose as the action.
+
+    Always kept are the first and last frame, pauses and gripper changes; between them the method adds the fewest poses
+    such that straight lines between key poses stay within epsilon of the recorded path on average.
+
+        histmv keyframe --dataset.repo_id=me/demos --dataset.root=demos --output.repo_id=me/keys --output.root=keys
+
+    Any LeRobot dataset works; where the tool position, rotation and gripper cannot be guessed from the feature names,
+    tell them: --columns.position=observation.state:0:3 --columns.gripper=action:6
+    """
+
+    dataset: SourceConfig
+    output: OutputConfig
+    # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
+    # which fail) or drop (leave those out).
+    replay: Literal["off", "flag", "drop"] = "off"
+    # Processes; the result does not depend on their number.
+    workers: int = 2
+    # Replace an existing output dataset.
+    overwrite: bool = False
 
 
 def run(config: KeyframeConfig) -> None:
@@ -133,7 +140,7 @@ def run(config: KeyframeConfig) -> None:
     place = Workplace(root, settings_of(config, source), config.overwrite, "keyframed")
     place.check_free()
     if config.output.push_to_hub:
-        hub.prepare(config.output.repo_id, config.output.private)
+        repositories.prepare(config.output.repo_id, config.output.private)
     demonstrations = understand(source, config.columns)
     scenes = read_scenes(source.root / RECORDING_FILE, source.meta.total_episodes) if config.replay != "off" else None
     with place.opened() as parts:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dataset_tools import build
 from dataset_tools.columns import Columns
-from dataset_tools.demonstrations import trajectory
+from dataset_tools.demonstrations import Demonstrations
 from dataset_tools.keyframe_shards import Keyframed, commit
 from dataset_tools.keyframes import KeyframeOptions, extract
 from dataset_tools.pool import one_thread_each, serve_parent
@@ -51,6 +51,7 @@ class Keyframer:
 
     def __init__(self, source: Source, job: KeyframeJob) -> None:
         self._source, self._job = source, job
+        self._demonstrations = Demonstrations(source, job.columns, job.ends)
         self._features = build.keyframed_features(source, job.columns)
         self._replayer = Replayer(job.scenes) if job.scenes else None
 
@@ -61,7 +62,7 @@ class Keyframer:
             ValueError: see ``Source.vectors``, ``trajectories``, ``keyframes.extract`` and ``frames.camera_frames``.
         """
         source, job = self._source, self._job
-        moved = trajectory(source, job.columns, job.ends, episode)
+        moved = self._demonstrations.trajectory(episode)
         found = extract(moved, job.options, episode, job.keep.get(episode, ()))
         action = labels(moved, found.keyframes[1:])
         failure = self._replayer.failure(episode, action) if self._replayer else ""

@@ -92,12 +92,12 @@ def run(config: RecordConfig) -> None:
     root = Path(config.root).expanduser().resolve() if config.root else default_root(repo_id)
     recorder = Recorder(settings, make_env, RecordPlace(root, settings, config.overwrite), repo_id)
     if config.push_to_hub:
-        from dataset_tools import hub  # here and below, because these imports take seconds
+        from dataset_tools.hub import repositories  # here and below, because these imports take seconds
 
-        hub.prepare(repo_id, config.private)
+        repositories.prepare(repo_id, config.private)
     recorder.record(config.episodes_per_variation or config.episodes, config.workers)
     if config.push_to_hub:
-        from dataset_tools.push import push_dataset
+        from dataset_tools.hub.push import push_dataset
 
         push_dataset(root, repo_id, config.private, config.license)
 

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-from dataset_tools import hub
 from dataset_tools.columns import vectors
+from dataset_tools.hub import repositories
 from lerobot_histmv import keys
 
 
@@ -104,9 +104,20 @@ def open_source(
 
 
 def open_dataset(
-    repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None, revision: str | None = None
+    repo_id: str,
+    root: str | Path | None = None,
+    episodes: Sequence[int] | None = None,
+    revision: str | None = None,
+    most: int | None = None,
 ) -> Source:
     """Dense or keyframed dataset; without ``root`` the local copy, else downloaded from the Hub as LeRobot does.
+
+    Args:
+        repo_id: its name.
+        root: folder that holds it.
+        episodes: those to read.
+        revision: branch, tag or commit on the Hub.
+        most: without ``episodes``, how many to take from the start; all by default.
 
     Raises:
         ValueError: no dataset at ``root``, damaged or missing files, an episode that does not exist, or a dataset that
@@ -114,9 +125,9 @@ def open_dataset(
     """
     if root is not None:
         check_files(Path(root))
-    with hub.explained(repo_id):
+    with repositories.explained(repo_id):
         meta = LeRobotDatasetMetadata(repo_id, root, revision)
-    chosen = tuple(range(meta.total_episodes)) if episodes is None else tuple(episodes)
+    chosen = tuple(range(meta.total_episodes)[:most] if episodes is None else episodes)
     unknown = sorted(set(chosen) - set(range(meta.total_episodes)))
     if unknown or not chosen:
         raise ValueError(
@@ -124,7 +135,7 @@ def open_dataset(
         )
     missing = missing_files(meta, chosen)
     if missing and root is None:
-        with hub.explained(repo_id):
+        with repositories.explained(repo_id):
             meta = LeRobotDataset(repo_id, episodes=list(chosen), revision=revision).meta
         missing = missing_files(meta, chosen)
     if missing:

@@ -13,8 +13,9 @@ from huggingface_hub import DatasetCard, ModelCard
 from lerobot.datasets import LeRobotDatasetMetadata
 from tiny_policy import TASK, tiny_config, tiny_policy
 
-from dataset_tools import card, cli
-from dataset_tools.card_commands import record_command
+from dataset_tools import cli
+from dataset_tools.hub import card
+from dataset_tools.hub.card_commands import record_command
 from dataset_tools.record import RecordConfig, checked_settings
 from dataset_tools.record_report import recording_report
 from dataset_tools.shards import Outcome

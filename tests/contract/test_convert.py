@@ -24,8 +24,9 @@ from helpers.foreign_episodes import (
 )
 from lerobot.datasets import LeRobotDataset
 
-from dataset_tools import cli, convert
-from dataset_tools.convert_rlbench import RLBenchSource
+from dataset_tools import cli
+from dataset_tools.convert import command as convert
+from dataset_tools.convert.rlbench import RLBenchSource
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import matrix_from_quaternion, project
 

@@ -20,8 +20,8 @@ from PIL import Image
 from rich.console import Console
 
 from dataset_tools.cli import main
-from dataset_tools.doctor import DoctorConfig, diagnose
-from dataset_tools.doctor_findings import CHECKS, Finding, Severity
+from dataset_tools.doctor.command import DoctorConfig, diagnose
+from dataset_tools.doctor.findings import CHECKS, Finding, Severity
 from dataset_tools.images import encode_rgb
 from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig
 from dataset_tools.keyframe import run as keyframe

@@ -185,7 +185,11 @@ def test_offline_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 def test_wrong_address_is_told(hub: Hub, tmp_path: Path, path: str, message: str) -> None:
     with serve() as gone:
         url = f"{hub.url}{path}" if path else gone.url
-    command = [sys.executable, "-c", "from dataset_tools import hub; hub.prepare('ann/dense', private=False)"]
+    command = [
+        sys.executable,
+        "-c",
+        "from dataset_tools.hub import repositories; repositories.prepare('ann/dense', private=False)",
+    ]
     variables = environment(url, tmp_path, "token-of-ann")
     result = subprocess.run(command, env=variables, capture_output=True, text=True)
     said = result.stderr.splitlines()[-1]

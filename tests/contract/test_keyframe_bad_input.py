@@ -196,18 +196,3 @@ def test_the_number_of_processes_does_not_change_the_data(dense: Path, monkeypat
     monkeypatch.setattr(keyframe_worker, "WORTH_A_PROCESS", 1)
     run(config(dense, workers=2, overwrite=True))
     assert data() == alone
-
-
-def test_what_a_killed_run_left_behind_is_cleared_or_put_back(tmp_path: Path) -> None:
-    root, old, partial = tmp_path / "keys", tmp_path / ".keys.old", tmp_path / ".keys.partial"
-    (old / "meta").mkdir(parents=True)
-    (old / "meta/info.json").write_text("{}")
-    partial.mkdir()
-    (partial / "half").write_text("")
-    with pytest.raises(ValueError, match="holds a dataset"), build.published(root, overwrite=False):
-        pass
-    assert (root / "meta/info.json").is_file()
-    with build.published(root, overwrite=True) as path:
-        path.mkdir()
-        (path / "new").write_text("")
-    assert [entry.name for entry in tmp_path.rglob("*")] == ["keys", "new"]

@@ -24,8 +24,9 @@ from helpers.episodes import (
 from lerobot.datasets import LeRobotDataset, delete_episodes
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from dataset_tools import cli, hub
+from dataset_tools import cli
 from dataset_tools import keyframe as keyframe_command
+from dataset_tools.hub import repositories
 from dataset_tools.images import encode_depth
 from lerobot_histmv import keys
 
@@ -145,7 +146,7 @@ def test_without_roots_the_datasets_lie_where_lerobot_keeps_them_and_may_be_uplo
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(hub, "prepare", lambda *arguments: done.append(arguments))
+    monkeypatch.setattr(repositories, "prepare", lambda *arguments: done.append(arguments))
     monkeypatch.setattr(keyframe_command, "push_dataset", lambda *arguments: done.append(arguments))
     write_vector_picks(HF_LEROBOT_HOME / "test/home")
     cli.main(["keyframe", "--dataset.repo_id=test/home", "--output.repo_id=test/away", "--output.push_to_hub=true"])

@@ -12,7 +12,7 @@ import draccus
 import pytest
 from fake_demonstrations import CAMERAS, FAILING_SEEDS, recorder
 
-from dataset_tools import hub, push
+from dataset_tools.hub import push, repositories
 from dataset_tools.record import RecordConfig, Recorder, checked_settings, run
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.record_report import default_root
@@ -120,7 +120,7 @@ def test_permission_to_upload_is_asked_for_before_and_the_dataset_goes_up_after(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(hub, "prepare", lambda repo_id, private: done.append(f"prepare {repo_id} {private}"))
+    monkeypatch.setattr(repositories, "prepare", lambda repo_id, private: done.append(f"prepare {repo_id} {private}"))
     monkeypatch.setattr(Recorder, "record", lambda *_: done.append("record"))
     monkeypatch.setattr(push, "push_dataset", lambda *arguments: done.append(f"push {arguments}"))
     words = ["--env.task=reach_target", "--repo_id=ann/dense", f"--root={tmp_path}/d", "--push_to_hub=true"]

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from dataset_tools.calibration_file import read_calibrations
+from dataset_tools.calibrate.file import read_calibrations
 
 SIZES = {"front": (23, 29), "wrist": (23, 29)}
 TURN = Rotation.from_rotvec([0.3, -1.1, 2.0])

@@ -10,8 +10,8 @@ import pytest
 from helpers.foreign_episodes import Scene, rlbench_classes, rlbench_observations, write_rlbench
 from PIL import Image
 
-from dataset_tools.convert_pickle import load, numbers
-from dataset_tools.convert_rlbench import DEPTH_CODES, RLBenchSource, decode_depth
+from dataset_tools.convert.pickle import load, numbers
+from dataset_tools.convert.rlbench import DEPTH_CODES, RLBenchSource, decode_depth
 from lerobot_histmv.geometry import deproject
 
 

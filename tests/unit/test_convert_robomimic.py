@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.foreign_episodes import CAMERAS, FRAMES, JOINTS, Scene, write_robomimic
 
-from dataset_tools.convert_robomimic import RobomimicSource, gripper_command
+from dataset_tools.convert.robomimic import RobomimicSource, gripper_command
 
 
 def robomimic(path: Path, cameras: tuple[str, ...] = (), instructions: tuple[str, ...] = ("lift",)) -> RobomimicSource:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.scene import RIG, episode, ray_cast
 
-from dataset_tools.doctor_calibration import evenly, on_tool
-from dataset_tools.doctor_findings import Severity
-from dataset_tools.doctor_geometry import (
+from dataset_tools.doctor.calibration import evenly, on_tool
+from dataset_tools.doctor.findings import Severity
+from dataset_tools.doctor.geometry import (
     DepthView,
     Instant,
     converted,

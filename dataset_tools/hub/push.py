@@ -1,0 +1,99 @@
+"""``histmv push``: a dataset or a checkpoint on disk, with its card, to the Hugging Face Hub."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from rich.console import Console
+
+from dataset_tools.build import default_root
+from dataset_tools.hub import card, repositories
+from dataset_tools.source import check_files, missing_files
+from lerobot_histmv import _plugin  # noqa: F401  (registers the policy)
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.model_card import model_card
+
+WEIGHTS, CONFIG = "model.safetensors", "config.json"
+
+
+@dataclass
+class PushConfig:
+    """Upload a dataset or a checkpoint, with a card that tells how it was made.
+
+        histmv push --repo_id=me/demos --root=demos
+        histmv push --repo_id=me/policy --root=outputs/train/checkpoints/last/pretrained_model
+
+    What breaks off may be repeated: the same command sends only what has not arrived, and until it is done readers see
+    what was there before. Needs an access token that may write: `hf auth login`, or the variable HF_TOKEN. In the card,
+    README.md beside the data, text outside of the marked part stays as you write it.
+    """
+
+    # Name on the Hub: user/name.
+    repo_id: str
+    # Folder of the dataset or checkpoint; by default LeRobot's own place for a dataset of this name.
+    root: Path | None = None
+    # Make the repository private.
+    private: bool = False
+    # Licence, as the Hub names it; by default what README.md says, else apache-2.0. A keyframed dataset stays under the
+    # licence of its source: say so if that is another one.
+    license: str | None = None
+
+
+def run(config: PushConfig) -> None:
+    """Write the card and upload.
+
+    Raises:
+        ValueError: the folder holds neither dataset nor checkpoint, or one that is not whole; or the Hub refuses.
+    """
+    root = (config.root or default_root(config.repo_id)).expanduser().resolve()
+    if (root / "meta/info.json").is_file():
+        push_dataset(root, config.repo_id, config.private, config.license)
+    elif (root / CONFIG).is_file() and (root / WEIGHTS).is_file():
+        push_checkpoint(root, config.repo_id, config.private, config.license)
+    else:
+        raise ValueError(
+            f"{root} is neither a LeRobot dataset (meta/info.json) nor a checkpoint ({CONFIG} and {WEIGHTS}); "
+            "give --root=FOLDER"
+        )
+
+
+def push_dataset(root: Path, repo_id: str, private: bool, license: str | None) -> None:
+    """Upload the dataset in ``root``, with its card, and say where it is.
+
+    Raises:
+        ValueError: it is not whole, or the Hub refuses.
+    """
+    check_files(root)
+    if not any(root.glob("meta/episodes/*/*.parquet")) or not (root / "meta/tasks.parquet").is_file():
+        raise ValueError(f"{root} lacks meta/episodes or meta/tasks.parquet; record or copy it again")
+    meta = LeRobotDatasetMetadata(repo_id, root)
+    if missing := missing_files(meta, range(meta.total_episodes)):
+        raise ValueError(f"{root} lacks {', '.join(map(str, missing))}; copy the dataset again")
+    written = card.dataset_card(root, meta, license)
+    url = repositories.prepare(repo_id, private)
+    written.save(root / card.CARD_FILE)
+    repositories.upload_dataset(root, repo_id, meta.info.codebase_version)
+    _say(f"{meta.total_episodes} episodes, {meta.total_frames} rows are at {url}")
+
+
+def push_checkpoint(folder: Path, repo_id: str, private: bool, license: str | None) -> None:
+    """Upload the checkpoint in ``folder``, with a card if it is of this project's policy, and say where it is.
+
+    Raises:
+        ValueError: it is damaged, or the Hub refuses.
+    """
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.repo_id = repo_id
+    url = repositories.prepare(repo_id, private, "model")
+    if isinstance(config, HistMVConfig):
+        training = TrainPipelineConfig.from_pretrained(folder) if (folder / "train_config.json").is_file() else None
+        made = model_card(config, training)
+        card.refreshed(made, folder / card.CARD_FILE, license).save(folder / card.CARD_FILE)
+    repositories.upload_checkpoint(folder, repo_id)
+    _say(f"the policy is at {url}; evaluate it with lerobot-eval --policy.path={repo_id}")
+
+
+def _say(line: str) -> None:
+    Console(highlight=False).print(line, soft_wrap=True)
