@@ -11,6 +11,9 @@ from jaxtyping import Float, Int
 
 from dataset_tools.fitness import Problem, fitness
 
+TOLERANCE = 1e-12
+"""A smaller gain [m] moves no gene."""
+
 
 @dataclass(frozen=True)
 class GeneticOptions:
@@ -24,7 +27,7 @@ class GeneticOptions:
         generations: at most so many.
         patience: generations without improvement after which the search stops.
         local_step: half of the mutations move a gene by at most so many free nodes, the others anywhere.
-        refine: whether each new best genome is improved gene by gene (coordinate descent).
+        refine: whether each new best genome is improved by coordinate descent.
     """
 
     population: int = 100
@@ -112,17 +115,40 @@ def offspring(
 
 
 def refine(problem: Problem, genome: Int[np.ndarray, " g"]) -> Int[np.ndarray, " g"]:
-    """Coordinate descent: each gene in turn goes to its best place while the others stay, until none moves."""
+    """Coordinate descent: each gene, then each two neighbours, go to their best places while the others stay."""
     moved = True
     while moved:
-        moved = False
-        for gene in range(len(genome)):
-            others = np.delete(genome, gene)
-            gains = insertion_gains(problem, selections(problem, others[None])[0])
-            place = int(gains.argmax())
-            if gains[place] > gains[genome[gene]] + 1e-12:
-                genome, moved = np.sort(np.append(others, place)), True
+        genome, moved = moved_singly(problem, genome)
+        if not moved:
+            genome, moved = moved_in_pairs(problem, genome)
     return genome
+
+
+def moved_singly(problem: Problem, genome: Int[np.ndarray, " g"]) -> tuple[Int[np.ndarray, " g"], bool]:
+    """Each gene in turn at its best place anywhere; and whether one moved."""
+    moved = False
+    for gene in range(len(genome)):
+        others = np.delete(genome, gene)
+        gains = insertion_gains(problem, selections(problem, others[None])[0])
+        place = int(gains.argmax())
+        if gains[place] > gains[genome[gene]] + TOLERANCE:
+            genome, moved = np.sort(np.append(others, place)), True
+    return genome, moved
+
+
+def moved_in_pairs(problem: Problem, genome: Int[np.ndarray, " g"]) -> tuple[Int[np.ndarray, " g"], bool]:
+    """Each two genes with no mandatory node between them at their best places between their neighbours."""
+    selection, moved = selections(problem, genome[None])[0], False
+    is_free = np.isin(selection, problem.free)
+    for place in np.flatnonzero(is_free[1:-2] & is_free[2:-1]) + 1:
+        left, first, second, right = selection[place - 1 : place + 3].tolist()
+        cost = problem.cost[left : right + 1, left : right + 1]
+        errors = cost[0, 1:-1, None] + cost[1:-1, 1:-1] + cost[1:-1, -1]
+        best = np.unravel_index(errors.argmin(), errors.shape)
+        if errors[best] < errors[first - left - 1, second - left - 1] - TOLERANCE:
+            selection[place : place + 2] = left + 1 + np.array(best)
+            moved = True
+    return np.searchsorted(problem.free, selection[is_free]), moved
 
 
 def insertion_gains(problem: Problem, selection: Int[np.ndarray, " k"]) -> Float[np.ndarray, " f"]:

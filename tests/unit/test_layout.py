@@ -14,11 +14,12 @@ SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROO
 
 ENVS = [path for path in SOURCES if path.match("lerobot_histmv/envs/*.py")]
 ENVS_WITH_LEROBOT = {"configuration_ur5.py", "processor_ur5.py"}
+PURE = {Path("lerobot_histmv/geometry.py"), Path("lerobot_histmv/keys.py")}
 KEYFRAMING = {"signals", "fitness", "genetic", "exact", "simplify", "keyframes"}
 
 RULES: dict[str, tuple[list[Path], set[str]]] = {
     "model and geometry know no LeRobot": (
-        [path for path in SOURCES if path.match("lerobot_histmv/model/*.py") or path.stem in ("geometry", "keys")],
+        [path for path in SOURCES if path.parent.parts[1:] == ("model",) or path in PURE],
         {"lerobot", "dataset_tools", "mujoco"},
     ),
     "environments know neither torch nor LeRobot": (

@@ -140,7 +140,7 @@ class Assembly(Chain):
             PlaceShapeInShapeSorter,
             {
                 "sorter": Region((0.44, 0.47), (-0.34, -0.31), (np.pi / 2 - 0.1, np.pi / 2 + 0.1)),
-                "shapes": Region((0.27, 0.48), (-0.24, -0.07)),
+                "shapes": Region((0.26, 0.48), (-0.205, -0.065)),
             },
         ),
     )
