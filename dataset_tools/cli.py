@@ -41,6 +41,9 @@ COMMANDS = {
         "dataset_tools.doctor.command", "what is wrong with a LeRobot dataset, and how to mend it, before training"
     ),
     "keyframe": Command("dataset_tools.keyframe", "keep an episode's key poses: a dataset of one row per macro step"),
+    "keyframe-many": Command(
+        "dataset_tools.many.command", "the same for a large dataset, in pieces, here or on a Slurm cluster"
+    ),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
     "push": Command("dataset_tools.hub.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),
     "inspect": Command(

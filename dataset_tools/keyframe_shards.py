@@ -16,7 +16,6 @@ from dataset_tools.keyframes import Keyframing
 from dataset_tools.record_place import RECORDING_FILE
 from dataset_tools.replay import SOURCE_RECORDING_FILE
 from dataset_tools.shards import Statistics, as_arrays, as_lists, delete_leftovers, read_header, write_table
-from dataset_tools.signals import Keyframe
 from lerobot_histmv import keys
 
 _SHARD = "episode-{:08d}.parquet"
@@ -55,8 +54,7 @@ def read_keyframed(path: Path) -> Keyframed:
         pyarrow.ArrowInvalid: the shard is damaged.
     """
     told = read_header(path)
-    frames = tuple(Keyframe(**frame) for frame in told["keyframing"]["keyframes"])
-    keyframing = Keyframing(**{**told["keyframing"], "keyframes": frames})
+    keyframing = Keyframing.from_json(told["keyframing"])
     statistics = as_arrays(told["statistics"])
     return Keyframed(
         told["episode"], keyframing, told["failure"], tuple(told["tasks"]), statistics, tuple(told["warnings"])

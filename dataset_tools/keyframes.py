@@ -2,10 +2,11 @@
 
 import math
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -92,6 +93,11 @@ class Keyframing:
     gap: float
     seconds: float
     warning: str
+
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> "Keyframing":
+        """What ``dataclasses.asdict`` made of one, after JSON."""
+        return cls(**{**told, "keyframes": tuple(Keyframe(**frame) for frame in told["keyframes"])})
 
 
 def extract(

@@ -22,6 +22,9 @@ FORMAT = 1
 GAP_COUNTS_ABOVE = 1e-3
 """The median gap is over episodes whose optimum is above this mean error [m per frame]; elsewhere it is noise."""
 
+SHOWN = 100
+"""Episodes that the terminal shows; the file shows all."""
+
 _MARKS = {"start": "s", "pause": "p", "gripper": "g", "ga": "+", "end": "e", "user": "u"}
 _LEGEND = "pose frames: s start, p pause, g gripper change, + chosen by the method, e end, u asked for"
 
@@ -170,8 +173,11 @@ class Report:
     def show(self, console: Console) -> None:
         """Print the table and the summary."""
         table = Table(*self.head(), title=f"Keyframes of {self.source}", caption=_LEGEND)
-        for row in self.rows():
+        rows = self.rows()
+        for row in rows[:SHOWN]:
             table.add_row(*row)
+        if len(rows) > SHOWN:
+            table.add_row(*["..."] * len(self.head()))
         console.print(table)
         for line in self.summary():
             console.print(line, highlight=False, markup=False)

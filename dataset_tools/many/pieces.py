@@ -1,0 +1,59 @@
+"""A large dataset in pieces: each is keyframed by the plain command into a dataset of its own, then all are merged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dataset_tools.keyframe import KeyframeConfig, run
+
+
+@dataclass(frozen=True)
+class KeyframePiece:
+    """One task of the engine; finished pieces are left as they are, started ones are continued.
+
+    Attributes:
+        config: options of the whole dataset, all of them told: nothing is guessed from a piece alone.
+        episodes: of the whole dataset.
+        folder: where the pieces lie.
+    """
+
+    config: KeyframeConfig
+    episodes: tuple[int, ...]
+    folder: Path
+
+    def __call__(self, data: object, rank: int, world_size: int) -> None:
+        """Keyframe piece ``rank`` of ``world_size``.
+
+        Raises:
+            ValueError: see ``keyframe.run``.
+        """
+        root = piece(self.folder, rank)
+        if not (root / "meta/info.json").is_file():  # it appears whole
+            run(piece_config(self.config, split(self.episodes, world_size)[rank], root))
+
+
+def piece(folder: Path, rank: int) -> Path:
+    """Where a piece lies."""
+    return folder / f"piece-{rank:06d}"
+
+
+def split(episodes: Sequence[int], pieces: int) -> list[list[int]]:
+    """Neighbouring episodes, as evenly as possible."""
+    return [part.tolist() for part in np.array_split(np.array(episodes, dtype=np.int64), pieces)]
+
+
+def piece_config(config: KeyframeConfig, episodes: list[int], root: Path) -> KeyframeConfig:
+    """Options of one piece."""
+    names = {name: getattr(config, name) for name in KeyframeConfig.__dataclass_fields__}
+    told: dict[str, Any] = {
+        **names,
+        "dataset": replace(config.dataset, episodes=episodes),
+        "output": replace(config.output, root=root, push_to_hub=False),
+        "keep": {episode: frames for episode, frames in config.keep.items() if episode in set(episodes)},
+        "workers": 1,
+        "overwrite": False,
+    }
+    return KeyframeConfig(**told)
