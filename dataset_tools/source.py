@@ -15,6 +15,7 @@ from jaxtyping import Float
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from dataset_tools.columns import vectors
+from dataset_tools.data_files import read_rows
 from dataset_tools.hub import repositories
 from lerobot_histmv import keys
 
@@ -53,20 +54,19 @@ class Source:
             ValueError: the file is damaged or lacks some of these rows.
         """
         path = self.root / self.meta.get_data_file_path(episode)
-        wanted = range(self.length(episode)) if frames is None else frames
-        rows = pc.field("episode_index") == episode
-        if frames is not None:
-            rows &= pc.field("frame_index").isin(list(frames))
+        told = self.meta.episodes[episode]
+        length, names = self.length(episode), tuple(dict.fromkeys((*columns, "episode_index", "frame_index")))
         try:
-            table = pq.read_table(path, columns=[*columns, "frame_index"], filters=rows)
-        except (OSError, pa.ArrowException) as error:
+            table = read_rows(path, told["dataset_from_index"], told["dataset_to_index"], names)
+        except (OSError, KeyError, pa.ArrowException) as error:
             raise ValueError(f"episode {episode}: cannot read {', '.join(columns)} from {path}: {error}") from error
-        if table.column("frame_index").to_pylist() != list(wanted):
+        own = pc.sum(pc.equal(table["episode_index"], episode)).as_py() or 0
+        if own != length or table["frame_index"].to_pylist() != list(range(length)):
             raise ValueError(
-                f"episode {episode}: {path} holds {len(table)} of {len(wanted)} wanted rows, or not in order; the "
+                f"episode {episode}: {path} holds {own} of {length} rows, or not in their place; the "
                 "dataset is not whole, so copy it again"
             )
-        return table
+        return table if frames is None else table.take(list(frames))
 
     def vectors(self, episode: int, wanted: Collection[str] | None = None) -> dict[str, Float[np.ndarray, "n _"]]:
         """Numeric columns of action and observation of a whole episode, all or the ``wanted``, (frames, size) each.
