@@ -3,8 +3,8 @@
     python benchmarks/scale.py [--sizes 100 1000 10000] [--folder=outputs/scale]
 
 Makes a dense dataset of each size (paths of ``paths.py``, rotation, gripper; no images), keyframes it with
-``histmv keyframe-many`` in two processes, and tells seconds and processor time per episode and the largest memory of a
-process. A dataset that is there is not made again. Results go to ``benchmarks/results/scale.json``.
+``histmv keyframe-many`` in pieces of 500 episodes, one process, and tells seconds and processor time per episode, and
+the largest memory. A dataset that is there is not made again. Results go to ``benchmarks/results/scale.json``.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def measure(folder: Path, episodes: int) -> dict[str, Any]:
     command = [
         str(Path(sys.executable).parent / "histmv"), "keyframe-many", "--dataset.repo_id=local/scale",
         f"--dataset.root={dense}", "--output.repo_id=local/scale_keyframes", f"--output.root={output}",
-        f"--pieces={max(2, episodes // 500)}", "--workers=2",
+        f"--pieces={max(1, episodes // 500)}", "--workers=1",
     ]  # fmt: skip
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -82,7 +82,7 @@ def measure(folder: Path, episodes: int) -> dict[str, Any]:
         "seconds": round(wall, 1),
         "ms_per_episode": round(1000 * wall / episodes, 1),
         "processor_ms_per_episode": round(1000 * spent / episodes, 1),
-        "largest_process_mb": round(after.ru_maxrss / 1024),
+        "largest_memory_mb": round(after.ru_maxrss / 1024),
     }
 
 
@@ -97,7 +97,7 @@ def main() -> None:
     for size in sorted(args.sizes):
         rows.append(measure(args.folder, size))
         print(rows[-1], flush=True)
-    write_json(RESULTS, {"frames_per_episode": FRAMES, "processes": 2, "sizes": rows})
+    write_json(RESULTS, {"frames_per_episode": FRAMES, "processes": 1, "sizes": rows})
 
 
 if __name__ == "__main__":

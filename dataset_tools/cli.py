@@ -44,6 +44,9 @@ COMMANDS = {
     "keyframe-many": Command(
         "dataset_tools.many.command", "the same for a large dataset, in pieces, here or on a Slurm cluster"
     ),
+    "cache-clip": Command(
+        "dataset_tools.clip.command", "store frozen CLIP vectors with a dataset, so that training never runs CLIP"
+    ),
     "replay": Command("dataset_tools.replay_check", "do a keyframed dataset's key poses still do the task?"),
     "push": Command("dataset_tools.hub.push", "upload a dataset or a checkpoint to the Hugging Face Hub, with a card"),
     "inspect": Command(

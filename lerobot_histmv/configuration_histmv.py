@@ -101,6 +101,9 @@ class HistMVConfig(PreTrainedConfig):
             raise ValueError(
                 "policy.cameras is empty: name the calibrated cameras, or train on a dataset with calibration"
             )
+        # Stored CLIP vectors spare training the towers; an environment gives none, and none are needed.
+        for key in [key for key in self.input_features or {} if key.startswith(keys.CLIP_PREFIX)]:
+            del self.input_features[key]
         inputs = self.input_features or {}
         wanted = [key(camera) for camera in self.cameras for key in (keys.rgb_key, keys.depth_key)]
         missing = [key for key in (*wanted, keys.STATE, keys.INTRINSICS, keys.EXTRINSICS) if key not in inputs]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 OBS_PREFIX = "observation."
 IMAGES_PREFIX = "observation.images."
 DEPTH_SUFFIX = "_depth"
+CLIP_PREFIX = "observation.clip."
 
 STATE = "observation.state"
 ACTION = "action"
@@ -44,6 +45,11 @@ def rgb_key(camera: str) -> str:
 def depth_key(camera: str) -> str:
     """Dataset key of the depth image (uint16 millimetres) of ``camera``."""
     return f"{IMAGES_PREFIX}{camera}{DEPTH_SUFFIX}"
+
+
+def clip_key(fingerprint: str, camera: str) -> str:
+    """Dataset key of the stored CLIP vectors of ``camera``; ``fingerprint`` tells weights and preprocessing."""
+    return f"{CLIP_PREFIX}{fingerprint}.{camera}"
 
 
 def intrinsics_names(cameras: Sequence[str]) -> list[str]:

@@ -105,7 +105,7 @@ class HistMVPolicy(PreTrainedPolicy):
             reduction: "mean" for a scalar, "none" for one loss per window.
         """
         config = self.config
-        window = read_window(batch, config.cameras)
+        window = read_window(batch, config.cameras, self.net.semantics.stored_as)
         sentences = self._paraphrase(batch["task"]) if self.training else batch["task"]
         text = self.net.semantics.text(sentences, window.real.device)
         with full_precision(window.depth):

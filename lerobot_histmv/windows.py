@@ -34,6 +34,7 @@ class Window:
         extrinsics: T_world_cam.
         tool: measured tool position [m].
         action: target position [m], quaternion wxyz, gripper; absent at inference.
+        clip: stored semantic vectors of the views, of the images as recorded; absent if the data hold none that fit.
     """
 
     real: Bool[Tensor, "b t"]
@@ -43,6 +44,7 @@ class Window:
     extrinsics: Float[Tensor, "n k 3 4"]
     tool: Float[Tensor, "n 3"]
     action: Float[Tensor, "n 8"] | None
+    clip: Float[Tensor, "n k g"] | None = None
 
     @property
     def target(self) -> Float[Tensor, "n 8"]:
@@ -61,7 +63,7 @@ class Window:
         if tool is None or heat is None:
             tool, heat = self._past_tools()
         owner = self.real.nonzero()[:, 0]
-        return Observation(self.rgb, self.depth, self.intrinsics, self.extrinsics, tool, heat, text[owner])
+        return Observation(self.rgb, self.depth, self.intrinsics, self.extrinsics, tool, heat, text[owner], self.clip)
 
     def _past_tools(self) -> tuple[Float[Tensor, "n t 3"], Float[Tensor, "n t"]]:
         """Tool positions of each real row's window and their heat at that row: 0 for padding and for the future."""
@@ -122,12 +124,13 @@ def row_weights(real: Bool[Tensor, "b u"], past_steps: int) -> Float[Tensor, " n
     return torch.where(count <= past_steps, 1 / count, last.float())[real]
 
 
-def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
+def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None = None) -> Window:
     """Pack a batch of neighbourhoods (training) or of single observations (inference).
 
     Args:
         batch: what LeRobot's loader or environment gives: 2s + 1 rows around each drawn row, or one row.
         cameras: views in the policy's order.
+        stored_as: fingerprint of the CLIP vectors that may be taken from the batch; None for none.
 
     Raises:
         ValueError: a camera of the policy is missing in the batch.
@@ -146,6 +149,8 @@ def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
         return batch[key][picked]
 
     depth = torch.stack([pick(keys.depth_key(camera)) for camera in cameras], dim=1)
+    vectors = [keys.clip_key(stored_as, camera) for camera in cameras] if stored_as else []
+    stored = bool(vectors) and all(key in batch for key in vectors)
     return Window(
         real=real,
         rgb=torch.stack([pick(keys.rgb_key(camera)) for camera in cameras], dim=1),
@@ -154,4 +159,5 @@ def read_window(batch: dict[str, Any], cameras: list[str]) -> Window:
         extrinsics=rearrange(pick(keys.EXTRINSICS), "n (k i j) -> n k i j", i=3, j=4),
         tool=pick(keys.STATE)[:, :3],
         action=pick(keys.ACTION) if batch.get(keys.ACTION) is not None else None,
+        clip=torch.stack([pick(key) for key in vectors], dim=1) if stored else None,
     )

