@@ -52,7 +52,7 @@ def towers(file: Path) -> ClipTowers:
 
 
 def policy_and_batch(data: Path, file: Path) -> tuple[Any, dict[str, Any]]:
-    """A policy in training with the frozen towers of ``file``, and windows of ``data`` as ``lerobot-train`` feeds it."""
+    """A policy in training with the frozen towers of ``file``, and windows of ``data`` as LeRobot gives them."""
     network = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(file)))
     config = HistMVConfig(device="cpu", push_to_hub=False, network=network, augment=STILL)
     meta = LeRobotDatasetMetadata("local/tiny", root=data)
