@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dataset_tools import exact, simplify
-from dataset_tools.fitness import Problem
+from dataset_tools.fitness import Problem, path_deviations
 from dataset_tools.genetic import GeneticOptions
 from dataset_tools.keyframes import KeyframeOptions, extract
 from dataset_tools.signals import Trajectory
@@ -90,6 +90,34 @@ def test_a_stationary_episode_and_one_of_two_frames_give_two_keyframes(method: s
     assert poses(Trajectory(still[:2], 20.0), method=method) == [0, 1]
     for found in (extract(Trajectory(path, 20.0), KeyframeOptions(method=method)) for path in (still, still[:2])):  # type: ignore[arg-type]
         assert (found.error_sum, found.error_max, found.gap) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_closed_loop_keeps_frames_far_from_its_ends(method: str) -> None:
+    turn = np.linspace(0, 2 * np.pi, 61)
+    loop = np.stack([0.1 * np.cos(turn), 0.1 * np.sin(turn), np.zeros(61)], axis=-1)
+    kept = poses(Trajectory(loop, 20.0), method=method, epsilon=0.01)
+    assert (kept[0], kept[-1]) == (0, 60)
+    assert len(kept) == 2 if method == "heuristic" else np.ptp(loop[kept], axis=0)[:2].min() > 0.1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_long_episode_is_thinned_for_the_search_alone(method: str) -> None:
+    long = bends(5, n=5003, corners=11)
+    found = extract(long, KeyframeOptions(method=method))  # type: ignore[arg-type]
+    kept = [frame.pose_frame for frame in found.keyframes]
+    away = path_deviations(long.position, np.array(kept))
+    assert (kept[0], kept[-1]) == (0, 5002)
+    assert found.frames == 5003
+    assert len(kept) <= 30 or found.warning
+    assert np.isclose(found.error_mean, away.mean())
+    assert np.isclose(found.error_max, away.max())
+
+
+def test_jitter_costs_few_keyframes() -> None:
+    calm, rng = bends(3), np.random.default_rng(3)
+    shaken = Trajectory(calm.position + rng.normal(0, 0.002, calm.position.shape), 20.0)
+    assert abs(len(poses(shaken)) - len(poses(calm))) <= 2
 
 
 def test_one_frame_is_refused() -> None:

@@ -1,0 +1,96 @@
+"""Kill -9 at random moments: is any finished episode ever lost, and is the result that of an undisturbed run?
+
+    python benchmarks/kills.py DENSE [--kills=50] [--folder=outputs/kills]
+
+Keyframes the dataset at DENSE once undisturbed, then again in two processes, killed after a random time and started
+again. After each kill all finished episodes must still be there, byte for byte. Results go to
+``benchmarks/results/kills.json``.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from hashlib import sha256
+from pathlib import Path
+
+import pyarrow.parquet as pq
+from tqdm import tqdm
+
+from dataset_tools.shards import write_json
+
+RESULTS = Path(__file__).parent / "results" / "kills.json"
+LONGEST = 12.0
+"""Seconds after which a run is killed at the latest, counted from its first finished episode."""
+
+
+def start(dense: Path, output: Path) -> subprocess.Popen:
+    """``histmv keyframe`` in a process group of its own."""
+    command = [
+        str(Path(sys.executable).parent / "histmv"), "keyframe", "--dataset.repo_id=local/dense",
+        f"--dataset.root={dense}", "--output.repo_id=local/keys", f"--output.root={output}", "--workers=2",
+    ]  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+def digests(parts: Path) -> dict[str, str]:
+    """Content of the finished episodes' files."""
+    return {path.name: sha256(path.read_bytes()).hexdigest() for path in parts.glob("episode-*.parquet")}
+
+
+def killed(dense: Path, output: Path, chance: random.Random) -> None:
+    """One run, killed with all its processes; returns early if it finishes."""
+    parts, run = output.with_name(f"{output.name}.parts"), start(dense, output)
+    before = set(digests(parts))
+    while run.poll() is None and set(digests(parts)) <= before and not output.exists():
+        time.sleep(0.05)
+    deadline = time.monotonic() + chance.uniform(0, LONGEST)
+    while run.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    if run.poll() is None:
+        os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+
+
+def rows(root: Path) -> list[dict]:
+    """All rows of a dataset."""
+    return [row for path in sorted(root.glob("data/*/*.parquet")) for row in pq.read_table(path).to_pylist()]
+
+
+def main() -> None:
+    """Kill, check, tell."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("dense", type=Path)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/kills"))
+    args = parser.parse_args()
+    shutil.rmtree(args.folder, ignore_errors=True)
+    args.folder.mkdir(parents=True)
+    whole, output = args.folder / "undisturbed", args.folder / "killed"
+    if start(args.dense, whole).wait() != 0:
+        raise RuntimeError(f"histmv keyframe fails on {args.dense}")
+    chance, lost, rounds, finished = random.Random(0), 0, 0, 0
+    parts = output.with_name(f"{output.name}.parts")
+    for _ in tqdm(range(args.kills), unit="kill"):
+        before = digests(parts)
+        killed(args.dense, output, chance)
+        if output.exists():  # a finished run: begin again
+            finished += 1
+            lost += rows(output) != rows(whole)
+            shutil.rmtree(output)
+            continue
+        after = digests(parts)
+        lost += sum(after.get(name) != digest for name, digest in before.items())
+        rounds += 1
+    start(args.dense, output).wait()
+    same = rows(output) == rows(whole)
+    write_json(RESULTS, {"kills": rounds, "finished_runs": finished, "lost_episodes": lost, "same_result": same})
+    print(RESULTS.read_text())
+
+
+if __name__ == "__main__":
+    main()
