@@ -1,0 +1,1 @@
+"""Camera calibrations from YAML: ``histmv calibrate-attach``."""

@@ -1,0 +1,1 @@
+"""Frozen CLIP vectors as columns: ``histmv cache-clip``."""

@@ -1,0 +1,1 @@
+"""The Hugging Face Hub: cards, uploads, ``histmv push``."""

@@ -1,0 +1,1 @@
+"""Large datasets in pieces: ``histmv keyframe-many``."""
