@@ -16,6 +16,7 @@ from rich.table import Table
 from dataset_tools.eval_results import wilson_interval
 from dataset_tools.replay import SOURCE_RECORDING_FILE, Replayer, read_scenes
 from dataset_tools.shards import write_json
+from dataset_tools.source import open_dataset
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
 
@@ -54,11 +55,13 @@ def run(config: ReplayConfig) -> None:
     """Replay, report and, if asked to, write the episodes that succeed.
 
     Raises:
-        ValueError: the dataset is not keyframed, or tells no scenes; or something is in the way of the output.
+        ValueError: the dataset cannot be read, is not keyframed, or tells no scenes; or something is in the way of the
+            output.
     """
     console = Console(highlight=False)
-    dataset = LeRobotDataset(config.dataset.repo_id, root=config.dataset.root)
-    if keys.SOURCE_EPISODE not in dataset.features:
+    source = open_dataset(config.dataset.repo_id, config.dataset.root)
+    dataset = LeRobotDataset(config.dataset.repo_id, root=source.root)
+    if not source.is_keyframed:
         raise ValueError(f"{config.dataset.repo_id} is not keyframed; make it so with histmv keyframe")
     place = _place(config, dataset) if config.drop_failed else None
     failures = _replay(dataset, console)

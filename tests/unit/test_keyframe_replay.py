@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lerobot_histmv.envs
+from dataset_tools import replay_check
 from dataset_tools.columns import Column, Columns
 from dataset_tools.keyframe import without_failures
 from dataset_tools.keyframe_shards import Keyframed
@@ -96,3 +97,8 @@ def test_what_fails_in_replay_is_told_with_what_became_of_it() -> None:
     assert without_failures(done) == done[:1]
     with pytest.raises(ValueError, match="no episode's key poses succeed"):
         without_failures(done[1:])
+
+
+def test_a_folder_without_a_dataset_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no LeRobot dataset at"):
+        replay_check.run(replay_check.ReplayConfig(replay_check.KeyframedConfig("test/keys", tmp_path)))
