@@ -58,13 +58,14 @@ class Source:
         length, names = self.length(episode), tuple(dict.fromkeys((*columns, "episode_index", "frame_index")))
         try:
             table = read_rows(path, told["dataset_from_index"], told["dataset_to_index"], names)
+            if not _is_episode(table, episode, length):  # rows lie elsewhere when another episode has lost some
+                table = pq.read_table(path, columns=list(names), filters=pc.field("episode_index") == episode)
         except (OSError, KeyError, pa.ArrowException) as error:
             raise ValueError(f"episode {episode}: cannot read {', '.join(columns)} from {path}: {error}") from error
-        own = pc.sum(pc.equal(table["episode_index"], episode)).as_py() or 0
-        if own != length or table["frame_index"].to_pylist() != list(range(length)):
+        if not _is_episode(table, episode, length):
             raise ValueError(
-                f"episode {episode}: {path} holds {own} of {length} rows, or not in their place; the "
-                "dataset is not whole, so copy it again"
+                f"episode {episode}: {path} holds {len(table)} of {length} rows, or not in order; the dataset is not "
+                "whole, so copy it again"
             )
         return table if frames is None else table.take(list(frames))
 
@@ -91,6 +92,12 @@ class Source:
     def task(self, index: int) -> str:
         """Instruction that a ``task_index`` stands for."""
         return str(self.meta.tasks.iloc[index].name)
+
+
+def _is_episode(table: pa.Table, episode: int, length: int) -> bool:
+    """Whether ``table`` holds the rows of an episode, all of them and in order."""
+    own = np.asarray(table["episode_index"]) == episode
+    return len(own) == length and bool(own.all()) and np.array_equal(table["frame_index"], np.arange(length))
 
 
 def open_source(

@@ -16,6 +16,7 @@ from dataset_tools.columns import ColumnsConfig
 from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig, run
 from dataset_tools.keyframes import KeyframeOptions, extract
 from dataset_tools.signals import Trajectory
+from dataset_tools.source import open_source
 from lerobot_histmv import keys
 
 LENGTH = len(motion_of(np.random.default_rng(0))["position"])
@@ -196,3 +197,12 @@ def test_the_number_of_processes_does_not_change_the_data(dense: Path, monkeypat
     monkeypatch.setattr(keyframe_worker, "WORTH_A_PROCESS", 1)
     run(config(dense, workers=2, overwrite=True))
     assert data() == alone
+
+
+def test_other_episodes_are_read_although_one_has_lost_rows(dense: Path) -> None:
+    path = next(dense.glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.slice(3), path)
+    assert len(open_source("test/dense", dense).vectors(1)[keys.STATE]) == LENGTH
+    with pytest.raises(ValueError, match=rf"episode 0: .* holds {LENGTH - 3} of {LENGTH} rows"):
+        open_source("test/dense", dense).vectors(0)
