@@ -1,9 +1,21 @@
-"""Where a tool writes a new dataset, as its options say."""
+"""Which dataset a tool reads as a whole, and where it writes a new one, as its options say."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_tools.record_report import default_root
+
+
+@dataclass
+class WholeDataset:
+    """The dataset to read; it is not changed."""
+
+    # Name, such as user/demonstrations. Without a root it is looked for locally, then on the Hub, as LeRobot does.
+    repo_id: str
+    # Folder that holds the dataset.
+    root: Path | None = None
+    # Branch, tag or commit on the Hub.
+    revision: str | None = None
 
 
 @dataclass

@@ -14,24 +14,12 @@ from dataset_tools.calibrate.file import Calibration, read_calibrations
 from dataset_tools.column_guesses import resolve
 from dataset_tools.columns import NONE, Columns, ColumnsConfig
 from dataset_tools.dense_features import calibration_features
-from dataset_tools.output_place import OutputPlace
+from dataset_tools.output_place import OutputPlace, WholeDataset
 from dataset_tools.source import Source, open_source
 from dataset_tools.trajectories import trajectory_of
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import matrix_from_quaternion
-
-
-@dataclass
-class AttachSource:
-    """The dataset to read; it is not changed."""
-
-    # Name, such as user/demonstrations. Without a root it is looked for locally, then on the Hub, as LeRobot does.
-    repo_id: str
-    # Folder that holds the dataset.
-    root: Path | None = None
-    # Branch, tag or commit on the Hub.
-    revision: str | None = None
 
 
 @dataclass
@@ -45,7 +33,7 @@ class AttachConfig:
     which is joined to the tool's measured pose at every frame.
     """
 
-    dataset: AttachSource
+    dataset: WholeDataset
     # The YAML file.
     calibration: Path
     output: OutputPlace

@@ -1,8 +1,7 @@
 """``histmv cache-clip``: a dataset again, with the frozen CLIP vector of every colour image as further columns."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +12,8 @@ from rich.progress import Progress
 
 from dataset_tools.calibrate.added_columns import write_with_columns
 from dataset_tools.frames import camera_frames
-from dataset_tools.output_place import OutputPlace
+from dataset_tools.inspect.cameras import cameras_of
+from dataset_tools.output_place import OutputPlace, WholeDataset
 from dataset_tools.source import Source, open_dataset
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
@@ -22,18 +22,6 @@ from lerobot_histmv.model.semantics import ClipTowers
 
 BATCH = 32
 """Images per call of the tower."""
-
-
-@dataclass
-class ClipSource:
-    """The dataset to read; it is not changed."""
-
-    # Name, such as user/keys. Without a root it is looked for locally, then on the Hub, as LeRobot does.
-    repo_id: str
-    # Folder that holds the dataset.
-    root: Path | None = None
-    # Branch, tag or commit on the Hub.
-    revision: str | None = None
 
 
 @dataclass
@@ -47,7 +35,7 @@ class CacheClipConfig:
     vectors are those of the images as recorded; augmentation does not reach them.
     """
 
-    dataset: ClipSource
+    dataset: WholeDataset
     output: OutputPlace
     # Model by open_clip's name, or tiny.
     clip_model: str = "ViT-B-32"
@@ -71,11 +59,13 @@ def run(config: CacheClipConfig) -> None:
     source = open_dataset(told.repo_id, told.root, None, told.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    place = Workplace(root, {"source": str(source.root), **without_paths(config)}, config.overwrite, "encoded")
+    clip = {"clip_model": config.clip_model, "clip_pretrained": config.clip_pretrained}
+    place = Workplace(root, {"source": str(source.root), **clip}, config.overwrite, "encoded")
     place.check_free()
-    semantics = SemanticsConfig(clip_model=config.clip_model, clip_pretrained=config.clip_pretrained)
-    towers = ClipTowers(semantics).to(config.device).eval()
+    towers = ClipTowers(SemanticsConfig(**clip)).to(config.device).eval()
     wanted = {keys.clip_key(towers.fingerprint(), camera): keys.rgb_key(camera) for camera in cameras_of(source)}
+    if not wanted:
+        raise ValueError(f"{source.root} has no colour images; its features are {', '.join(source.features)}")
     if there := sorted(wanted.keys() & source.features.keys()):
         raise ValueError(f"{source.root} holds these vectors already: {', '.join(there)}")
     with place.opened(), Progress(console=console) as progress:
@@ -92,20 +82,6 @@ def run(config: CacheClipConfig) -> None:
         f"dataset {config.output.repo_id} in {root}",
         soft_wrap=True,
     )
-
-
-def without_paths(config: CacheClipConfig) -> dict[str, str]:
-    """What decides the vectors."""
-    return {name: asdict(config)[name] for name in ("clip_model", "clip_pretrained")}
-
-
-def cameras_of(source: Source) -> list[str]:
-    """Colour cameras; ValueError if there are none."""
-    found = [key for key in source.meta.camera_keys if key not in source.depth_keys]
-    cameras = [key.removeprefix(keys.IMAGES_PREFIX) for key in found if key.startswith(keys.IMAGES_PREFIX)]
-    if not cameras:
-        raise ValueError(f"{source.root} has no colour images; its features are {', '.join(source.features)}")
-    return cameras
 
 
 def vectors(

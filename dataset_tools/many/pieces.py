@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,13 +46,11 @@ def split(episodes: Sequence[int], pieces: int) -> list[list[int]]:
 
 def piece_config(config: KeyframeConfig, episodes: list[int], root: Path) -> KeyframeConfig:
     """Options of one piece."""
-    names = {name: getattr(config, name) for name in KeyframeConfig.__dataclass_fields__}
-    told: dict[str, Any] = {
-        **names,
-        "dataset": replace(config.dataset, episodes=episodes),
-        "output": replace(config.output, root=root, push_to_hub=False),
-        "keep": {episode: frames for episode, frames in config.keep.items() if episode in set(episodes)},
-        "workers": 1,
-        "overwrite": False,
-    }
-    return KeyframeConfig(**told)
+    return replace(
+        config,
+        dataset=replace(config.dataset, episodes=episodes),
+        output=replace(config.output, root=root, push_to_hub=False),
+        keep={episode: frames for episode, frames in config.keep.items() if episode in episodes},
+        workers=1,
+        overwrite=False,
+    )
