@@ -97,10 +97,15 @@ class Renderer:
 
 
 def _tent(samples: UInt8[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Halve an image: pixel u is the (1 2 1)-weighted mean of samples 2u, 2u + 1 and 2u + 2, in both directions."""
-    wide = samples.astype(np.uint16)
-    rows = wide[:-1:2] + 2 * wide[1::2] + wide[2::2]
-    return ((rows[:, :-1:2] + 2 * rows[:, 1::2] + rows[:, 2::2] + 8) >> 4).astype(np.uint8)
+    """Halve an image: pixel u is the (1 2 1)-weighted mean of samples 2u, 2u + 1 and 2u + 2, in both directions.
+
+    Columns are first added everywhere and then picked: slices that lie together are added twice as fast.
+    """
+    rows = samples[:-1:2].astype(np.uint16)
+    for neighbour in (samples[1::2], samples[1::2], samples[2::2]):
+        rows += neighbour
+    pairs = rows[:, :-1] + rows[:, 1:]
+    return ((pairs[:, :-1] + pairs[:, 1:] + 8) >> 4)[:, ::2].astype(np.uint8)
 
 
 def _graphics_context(side: int) -> Any:
