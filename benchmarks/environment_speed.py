@@ -31,7 +31,7 @@ RESULTS = Path(__file__).parent / "results" / "environment_speed.json"
 SEED = 500_000
 SIZE = 128
 DEMONSTRATED = "pick_and_lift"
-EPISODES, STEPS, REPETITIONS = 12, 4, 5
+EPISODES, STEPS, REPETITIONS = 12, 4, 9
 
 
 def demonstrate(env: UR5Env, seed: int) -> int:
