@@ -37,16 +37,21 @@ def start(dense: Path, output: Path) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
+def finished(parts: Path) -> set[str]:
+    """Names of the finished episodes' files."""
+    return {path.name for path in parts.glob("episode-*.parquet")}
+
+
 def digests(parts: Path) -> dict[str, str]:
     """Content of the finished episodes' files."""
-    return {path.name: sha256(path.read_bytes()).hexdigest() for path in parts.glob("episode-*.parquet")}
+    return {name: sha256((parts / name).read_bytes()).hexdigest() for name in finished(parts)}
 
 
 def killed(dense: Path, output: Path, chance: random.Random) -> None:
     """One run, killed with all its processes; returns early if it finishes."""
     parts, run = output.with_name(f"{output.name}.parts"), start(dense, output)
-    before = set(digests(parts))
-    while run.poll() is None and set(digests(parts)) <= before and not output.exists():
+    before = finished(parts)
+    while run.poll() is None and finished(parts) <= before and not output.exists():
         time.sleep(0.05)
     deadline = time.monotonic() + chance.uniform(0, LONGEST)
     while run.poll() is None and time.monotonic() < deadline:
@@ -73,13 +78,13 @@ def main() -> None:
     whole, output = args.folder / "undisturbed", args.folder / "killed"
     if start(args.dense, whole).wait() != 0:
         raise RuntimeError(f"histmv keyframe fails on {args.dense}")
-    chance, lost, rounds, finished = random.Random(0), 0, 0, 0
+    chance, lost, rounds, completed = random.Random(0), 0, 0, 0
     parts = output.with_name(f"{output.name}.parts")
     for _ in tqdm(range(args.kills), unit="kill"):
         before = digests(parts)
         killed(args.dense, output, chance)
         if output.exists():  # a finished run: begin again
-            finished += 1
+            completed += 1
             lost += rows(output) != rows(whole)
             shutil.rmtree(output)
             continue
@@ -88,7 +93,7 @@ def main() -> None:
         rounds += 1
     start(args.dense, output).wait()
     same = rows(output) == rows(whole)
-    write_json(RESULTS, {"kills": rounds, "finished_runs": finished, "lost_episodes": lost, "same_result": same})
+    write_json(RESULTS, {"kills": rounds, "finished_runs": completed, "lost_episodes": lost, "same_result": same})
     print(RESULTS.read_text())
 
 

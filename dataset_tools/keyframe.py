@@ -124,16 +124,20 @@ class KeyframeConfig(KeyframingConfig):
     overwrite: bool = False
 
 
-def run(config: KeyframeConfig) -> None:
+def run(config: KeyframeConfig, quiet: bool = False) -> None:
     """Read, choose, check, write, report. Nothing appears at the output before all of it is done.
 
     Killed and started again with the same options, it goes on with the episodes that are missing.
+
+    Args:
+        config: the options.
+        quiet: without progress and report on the terminal.
 
     Raises:
         ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
             ``trajectories``, ``frames``, ``workplace`` and ``hub``.
     """
-    console = Console()
+    console = Console(quiet=quiet)
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
     source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
     check_request(config, source, root)

@@ -3,10 +3,14 @@
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import patch
 
-from lerobot.datasets.aggregate import aggregate_datasets
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import aggregate
+from lerobot.datasets.utils import DEFAULT_DATA_FILE_SIZE_IN_MB
 from rich.console import Console
 
 from dataset_tools.columns import Columns
@@ -21,6 +25,10 @@ from dataset_tools.source import open_source
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
 
+EPISODES_FILE_MB = 1
+"""Size at which a file of episodes' metadata is closed."""
+EPISODES_FILES = "meta/episodes/chunk-*/file-*.parquet"
+
 
 @dataclass(frozen=True)
 class MergePieces:
@@ -33,7 +41,7 @@ class MergePieces:
         root: where the merged dataset shall be.
     """
 
-    config: KeyframeConfig
+    config: KeyframeConfig = field(repr=False)
     folder: Path
     pieces: int
     root: Path
@@ -58,8 +66,7 @@ class MergePieces:
         place = Workplace(self.root, settings_of(config, source), config.overwrite, "keyframed")
 
         def write(path: Path) -> None:
-            names = [f"local/{root.name}" for root in roots]
-            aggregate_datasets(names, config.output.repo_id, roots, path)
+            aggregated(roots, config.output.repo_id, path)
             for name in (keys.INSTRUCTIONS_FILE, SOURCE_RECORDING_FILE):
                 if (roots[0] / name).is_file():
                     shutil.copyfile(roots[0] / name, path / name)
@@ -72,6 +79,32 @@ class MergePieces:
         Console().print(f"written to {self.root}", highlight=False, soft_wrap=True)
         if config.output.push_to_hub:
             push_dataset(self.root, config.output.repo_id, config.output.private, config.output.license)
+
+
+def aggregated(roots: Sequence[Path], repo_id: str, path: Path) -> None:
+    """LeRobot's aggregation, with the episodes' metadata in small files.
+
+    LeRobot reads and writes the last file again for every piece, and would close it at 100 MB only: with 10,000
+    episodes that takes four times as long and half a gigabyte more, and both grow with their number.
+    """
+    names = [f"local/{root.name}" for root in roots]
+    with patch.object(aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_FILE_MB):
+        aggregate.aggregate_datasets(names, repo_id, list(roots), path, DEFAULT_DATA_FILE_SIZE_IN_MB)
+    for file in path.glob(EPISODES_FILES):
+        tell_place(file)
+
+
+def tell_place(file: Path) -> None:
+    """Correct what the rows of a file of episodes' metadata say about where they lie.
+
+    LeRobot 0.6.1 fills it in before it opens a new file, so that a further aggregation would miss the last one.
+    """
+    table = pq.read_table(file)
+    for what, name in (("chunk", file.parent.name), ("file", file.stem)):
+        column = table.schema.get_field_index(f"meta/episodes/{what}_index")
+        number = pa.repeat(pa.scalar(int(name.split("-")[1]), pa.int64()), table.num_rows)
+        table = table.set_column(column, table.schema.field(column), number)
+    pq.write_table(table, file)
 
 
 def merged_report(roots: Sequence[Path], config: KeyframeConfig, columns: Columns, notices: Sequence[str]) -> Report:

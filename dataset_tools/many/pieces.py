@@ -1,7 +1,7 @@
 """A large dataset in pieces: each is keyframed by the plain command into a dataset of its own, then all are merged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,8 @@ class KeyframePiece:
         folder: where the pieces lie.
     """
 
-    config: KeyframeConfig
-    episodes: tuple[int, ...]
+    config: KeyframeConfig = field(repr=False)  # the engine writes its tasks into every log
+    episodes: tuple[int, ...] = field(repr=False)
     folder: Path
 
     def __call__(self, data: object, rank: int, world_size: int) -> None:
@@ -31,7 +31,7 @@ class KeyframePiece:
         """
         root = piece(self.folder, rank)
         if not (root / "meta/info.json").is_file():  # it appears whole
-            run(piece_config(self.config, split(self.episodes, world_size)[rank], root))
+            run(piece_config(self.config, split(self.episodes, world_size)[rank], root), quiet=True)
 
 
 def piece(folder: Path, rank: int) -> Path:

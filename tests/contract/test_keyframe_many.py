@@ -12,6 +12,7 @@ from helpers.episodes import write_vector_picks
 from lerobot.datasets import LeRobotDataset
 
 from dataset_tools import cli
+from dataset_tools.many import merge
 from dataset_tools.many import pieces as many_pieces
 from lerobot_histmv import keys
 
@@ -60,6 +61,17 @@ def test_pieces_give_what_one_run_gives(dense: Path, at_once: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["keys"]
 
 
+def test_episodes_tell_the_file_they_lie_in_when_there_are_several(
+    dense: Path, at_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merge, "EPISODES_FILE_MB", 0)
+    cli.main(["keyframe-many", *arguments(dense, tmp_path / "keys"), f"--pieces={PIECES}", "--workers=1"])
+    assert_same(tmp_path / "keys", at_once)
+    files = sorted((tmp_path / "keys").glob(merge.EPISODES_FILES))
+    told = [set(pq.read_table(file).column("meta/episodes/file_index").to_pylist()) for file in files]
+    assert told == [{number} for number in range(PIECES)]
+
+
 def test_a_stopped_run_goes_on_with_the_missing_pieces(
     dense: Path, at_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -67,11 +79,11 @@ def test_a_stopped_run_goes_on_with_the_missing_pieces(
     begun: list[tuple[int, ...]] = []
     real = many_pieces.run
 
-    def run_or_stop(config: many_pieces.KeyframeConfig) -> None:
+    def run_or_stop(config: many_pieces.KeyframeConfig, quiet: bool) -> None:
         begun.append(tuple(config.dataset.episodes or ()))
         if len(begun) == PIECES:
             raise KeyboardInterrupt
-        real(config)
+        real(config, quiet)
 
     monkeypatch.setattr(many_pieces, "run", run_or_stop)
     with pytest.raises((KeyboardInterrupt, SystemExit)):
