@@ -124,20 +124,28 @@ class KeyframeConfig(KeyframingConfig):
     overwrite: bool = False
 
 
-def run(config: KeyframeConfig, quiet: bool = False) -> None:
+def run(config: KeyframeConfig) -> None:
+    """Keyframe, and tell about it on the terminal.
+
+    Raises:
+        ValueError: see ``keyframe_dataset``.
+    """
+    keyframe_dataset(config, Console())
+
+
+def keyframe_dataset(config: KeyframeConfig, console: Console) -> None:
     """Read, choose, check, write, report. Nothing appears at the output before all of it is done.
 
     Killed and started again with the same options, it goes on with the episodes that are missing.
 
     Args:
         config: the options.
-        quiet: without progress and report on the terminal.
+        console: where progress and the report are shown.
 
     Raises:
         ValueError: an option, the dataset or the output place is not as it must be; see ``source``, ``column_guesses``,
             ``trajectories``, ``frames``, ``workplace`` and ``hub``.
     """
-    console = Console(quiet=quiet)
     root = (config.output.root or build.default_root(config.output.repo_id)).expanduser().resolve()
     source = open_source(config.dataset.repo_id, config.dataset.root, config.dataset.episodes, config.dataset.revision)
     check_request(config, source, root)

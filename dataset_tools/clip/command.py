@@ -1,7 +1,7 @@
 """``histmv cache-clip``: a dataset again, with the frozen CLIP vector of every colour image as further columns."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
@@ -59,10 +59,10 @@ def run(config: CacheClipConfig) -> None:
     source = open_dataset(told.repo_id, told.root, None, told.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    clip = {"clip_model": config.clip_model, "clip_pretrained": config.clip_pretrained}
-    place = Workplace(root, {"source": str(source.root), **clip}, config.overwrite, "encoded")
+    clip = SemanticsConfig(clip_model=config.clip_model, clip_pretrained=config.clip_pretrained)
+    place = Workplace(root, {"source": str(source.root), **asdict(clip)}, config.overwrite, "encoded")
     place.check_free()
-    towers = ClipTowers(SemanticsConfig(**clip)).to(config.device).eval()
+    towers = ClipTowers(clip).to(config.device).eval()
     wanted = {keys.clip_key(towers.fingerprint(), camera): keys.rgb_key(camera) for camera in cameras_of(source)}
     if not wanted:
         raise ValueError(f"{source.root} has no colour images; its features are {', '.join(source.features)}")

@@ -62,7 +62,7 @@ def run(config: KeyframeManyConfig) -> None:
     """Check, split, hand to the engine.
 
     Raises:
-        ValueError: see ``keyframe.run``; or the engine is not installed, or lacks an option.
+        ValueError: see ``keyframe.keyframe_dataset``; or the engine is not installed, or lacks an option.
     """
     executors = engine_module()
     root = (config.output.root or default_root(config.output.repo_id)).expanduser().resolve()

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
-from dataset_tools.keyframe import KeyframeConfig, run
+from dataset_tools.keyframe import KeyframeConfig, keyframe_dataset
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,12 @@ class KeyframePiece:
         """Keyframe piece ``rank`` of ``world_size``.
 
         Raises:
-            ValueError: see ``keyframe.run``.
+            ValueError: see ``keyframe.keyframe_dataset``.
         """
         root = piece(self.folder, rank)
         if not (root / "meta/info.json").is_file():  # it appears whole
-            run(piece_config(self.config, split(self.episodes, world_size)[rank], root), quiet=True)
+            episodes = split(self.episodes, world_size)[rank]
+            keyframe_dataset(piece_config(self.config, episodes, root), Console(quiet=True))
 
 
 def piece(folder: Path, rank: int) -> Path:

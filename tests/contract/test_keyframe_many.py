@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from helpers.episodes import write_vector_picks
 from lerobot.datasets import LeRobotDataset
+from rich.console import Console
 
 from dataset_tools import cli
 from dataset_tools.many import merge
@@ -77,15 +78,15 @@ def test_a_stopped_run_goes_on_with_the_missing_pieces(
 ) -> None:
     command = ["keyframe-many", *arguments(dense, tmp_path / "keys"), f"--pieces={PIECES}", "--workers=1"]
     begun: list[tuple[int, ...]] = []
-    real = many_pieces.run
+    real = many_pieces.keyframe_dataset
 
-    def run_or_stop(config: many_pieces.KeyframeConfig, quiet: bool) -> None:
+    def run_or_stop(config: many_pieces.KeyframeConfig, console: Console) -> None:
         begun.append(tuple(config.dataset.episodes or ()))
         if len(begun) == PIECES:
             raise KeyboardInterrupt
-        real(config, quiet)
+        real(config, console)
 
-    monkeypatch.setattr(many_pieces, "run", run_or_stop)
+    monkeypatch.setattr(many_pieces, "keyframe_dataset", run_or_stop)
     with pytest.raises((KeyboardInterrupt, SystemExit)):
         cli.main(command)
     assert not (tmp_path / "keys").exists()
