@@ -34,7 +34,17 @@ def keyframe_command(told: Mapping[str, Any], repo_id: str) -> str:
     options = {"dataset.repo_id": told["source"], "output.repo_id": repo_id}
     options |= {name: wanted[name] for name in ("method", "epsilon", "seed")}
     options |= {name: value for name, value in wanted.items() if usual.get(name) != value}
-    return _command("keyframe", options | _episodes(told) | _columns(told["columns"]))
+    return _command("keyframe", options | _kept(told) | _episodes(told) | _columns(told["columns"]))
+
+
+def _kept(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Frames that were asked for, unless they are key poses for another reason too."""
+    frames = {
+        episode["source_episode"]: [frame["pose_frame"] for frame in episode["keyframes"] if frame["reason"] == "user"]
+        for episode in told["episodes"]
+    }
+    asked = {number: found for number, found in frames.items() if found}
+    return {"keep": asked} if asked else {}
 
 
 def _episodes(told: Mapping[str, Any]) -> dict[str, Any]:
@@ -72,5 +82,5 @@ def _command(name: str, options: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> str:
-    """As draccus reads it: JSON, but text in lists without quotes."""
-    return json.dumps(value).replace('"', "").replace(" ", "")
+    """As draccus reads it: JSON, but text and keys without quotes."""
+    return json.dumps(value, separators=(",", ": ")).replace('"', "")

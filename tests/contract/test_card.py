@@ -21,7 +21,13 @@ from dataset_tools.record_report import recording_report
 from dataset_tools.shards import Outcome
 from lerobot_histmv import keys
 
-KEYFRAMING = ["--method=exact", "--epsilon=0.003", "--pause.dwell=0.13", "--columns.commanded=false"]
+KEYFRAMING = [
+    "--method=exact",
+    "--epsilon=0.003",
+    "--pause.dwell=0.13",
+    "--columns.commanded=false",
+    "--keep={2: [5, 6]}",
+]
 
 
 @pytest.fixture(scope="module")
