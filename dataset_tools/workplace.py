@@ -29,7 +29,7 @@ class Workplace:
 
     def __init__(self, root: Path, settings: Mapping[str, Any], overwrite: bool, done: str) -> None:
         self.root = root
-        self.parts = root.with_name(f"{root.name}.parts")
+        self.parts, self._removed = (root.with_name(f"{root.name}.{what}") for what in ("parts", "parts.removed"))
         self._settings, self._overwrite, self._done = settings, overwrite, done
 
     def check_free(self) -> None:
@@ -64,6 +64,7 @@ class Workplace:
         self._refuse_foreign()
         with only_one(self.parts, f"{self.root} is being {self._done} by another process", _LOCK):
             self._put_back()
+            shutil.rmtree(self._removed, ignore_errors=True)
             self.check_free()
             self._take_over()
             yield self.parts
@@ -109,6 +110,8 @@ class Workplace:
         self.clean_up()
 
     def clean_up(self) -> None:
-        """Remove the working directory of finished work."""
+        """Remove the working directory of finished work: all at once under its name, so that a kill leaves no half."""
         if (self.parts / _SETTINGS).exists():
-            shutil.rmtree(self.parts)
+            shutil.rmtree(self._removed, ignore_errors=True)
+            self.parts.rename(self._removed)
+            shutil.rmtree(self._removed)

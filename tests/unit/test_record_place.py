@@ -1,6 +1,7 @@
 """Nothing on disk is overwritten or mixed up by a recording that did not make it."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,6 +94,27 @@ def test_a_started_recording_is_only_continued_with_its_settings(tmp_path: Path)
         assert (parts / "attempt-000000.json").exists()
     with place(tmp_path / "data", overwrite=True, fps=10).opened():
         assert not (parts / "attempt-000000.json").exists()
+
+
+def test_a_kill_while_the_working_directory_is_removed_leaves_nothing_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(path: Path, **_: bool) -> None:
+        if path.exists():
+            for name in ("settings.json", "attempt-000000.json"):
+                (path / name).unlink()
+            raise KeyboardInterrupt
+
+    target = place(tmp_path / "data")
+    with pytest.raises(KeyboardInterrupt), target.opened() as parts:
+        for name in ("attempt-000000.json", "attempt-000001.json"):
+            (parts / name).write_text("{}")
+        monkeypatch.setattr(shutil, "rmtree", killed)
+        target.clean_up()
+    monkeypatch.undo()
+    with place(tmp_path / "data").opened() as parts:
+        assert not list(parts.glob("attempt-*"))
+    assert [path.name for path in tmp_path.iterdir()] == ["data.parts"]
 
 
 def test_a_working_directory_is_never_shared_nor_taken_from_others(tmp_path: Path) -> None:
