@@ -58,7 +58,8 @@ def killed(dense: Path, output: Path, chance: random.Random) -> None:
         time.sleep(0.02)
     if run.poll() is None:
         os.killpg(run.pid, signal.SIGKILL)
-    run.wait()
+    if run.wait() not in (0, -signal.SIGKILL):
+        raise RuntimeError(f"histmv keyframe refused to go on: {run.returncode}; see {parts}")
 
 
 def rows(root: Path) -> list[dict]:
@@ -91,7 +92,8 @@ def main() -> None:
         after = digests(parts)
         lost += sum(after.get(name) != digest for name, digest in before.items())
         rounds += 1
-    start(args.dense, output).wait()
+    if start(args.dense, output).wait() != 0:
+        raise RuntimeError(f"histmv keyframe refused to go on; see {parts}")
     same = rows(output) == rows(whole)
     write_json(RESULTS, {"kills": rounds, "finished_runs": completed, "lost_episodes": lost, "same_result": same})
     print(RESULTS.read_text())
