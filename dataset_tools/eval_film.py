@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 from lerobot.policies import PreTrainedPolicy
+from PIL import Image
 
 from dataset_tools import overlay
 from dataset_tools.video import VideoWriter
@@ -32,11 +33,15 @@ class Film:
 
     def show(self, scene: overlay.Scene, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
         """Append the frames of one step under the decision that led to it."""
-        self._canvas = overlay.draw_scene(scene)
+        self.add(overlay.draw_scene(scene), scene.step, frames)
+
+    def add(self, canvas: Image.Image, step: int, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
+        """Append the frames of one step on the ``canvas`` that was drawn of its decision."""
+        self._canvas = canvas
         for frame in frames:
             self._frames += 1
             self._last = frame
-            status = f"step {scene.step}     {self._seconds():.1f} s"
+            status = f"step {step}     {self._seconds():.1f} s"
             self._writer.add(overlay.draw_frame(self._canvas, frame, status))
 
     def finish(self, failure: str, success: bool) -> None:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from lerobot.configs import parser
 from lerobot.envs.configs import EnvConfig
@@ -14,6 +15,12 @@ from dataset_tools.eval_checkpoint import PolicySource
 
 REPORTED_SEEDS = 200_000
 """First seed of reported evaluations: neither recordings nor evaluations during training use seeds from here on."""
+
+
+class WithPolicy(Protocol):
+    """A configuration that names a policy."""
+
+    policy: PolicySource
 
 
 @dataclass
@@ -55,14 +62,19 @@ class EvaluateConfig:
 
     @classmethod
     def parse(cls, args: Sequence[str], prog: str) -> "EvaluateConfig":
-        """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
-        register_third_party_plugins()
-        arguments = list(args)
-        if {"-h", "--help"} & set(arguments):
-            parser.print_scoped_help(cls, arguments)
-            sys.exit(0)
-        path = parser.get_path_arg("policy", arguments)
-        overrides = parser.get_cli_overrides("policy", arguments) or []
-        config: EvaluateConfig = command_line.parse(cls, parser.filter_path_args("policy", arguments), prog)
-        config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
-        return config
+        """The configuration that a command line describes."""
+        return parse_with_policy(cls, args, prog)
+
+
+def parse_with_policy[Config: WithPolicy](config_class: type[Config], args: Sequence[str], prog: str) -> Config:
+    """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
+    register_third_party_plugins()
+    arguments = list(args)
+    if {"-h", "--help"} & set(arguments):
+        parser.print_scoped_help(config_class, arguments)
+        sys.exit(0)
+    path = parser.get_path_arg("policy", arguments)
+    overrides = parser.get_cli_overrides("policy", arguments) or []
+    config: Config = command_line.parse(config_class, parser.filter_path_args("policy", arguments), prog)
+    config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
+    return config
