@@ -50,9 +50,13 @@ class Film:
         outcome = "success" if success else f"failed: {failure}"
         color = overlay.SUCCESS if success else overlay.FAILURE
         picture = overlay.draw_frame(self._canvas, self._last, f"{outcome}     {self._seconds():.1f} s", color)
+        self.hold(picture)
+        self._writer.close()
+
+    def hold(self, picture: UInt8[np.ndarray, "y x 3"]) -> None:
+        """Append a whole frame that stays for a while, so that it can be read."""
         for _ in range(round(HOLD_SECONDS * self.fps)):
             self._writer.add(picture)
-        self._writer.close()
 
     def abandon(self) -> None:
         """Delete the unfinished file."""

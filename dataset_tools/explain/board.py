@@ -84,7 +84,17 @@ def _views(board: Image.Image, draw: ImageDraw.ImageDraw, record: Record, truth:
         for name, share in (("weight", record.weights[index]), ("certainty", record.certainties[index])):
             _bar(draw, (left, top), side, name, float(share), color if chosen else MUTED)
             top += LINE
-    return top
+        draw.text((left, top - 1), _alone(record, index, truth), font=font(13), fill=MUTED)
+    return top + LINE
+
+
+def _alone(record: Record, index: int, truth: Float[np.ndarray, " 8"] | None) -> str:
+    """How far off the true position a view would have sent the tool by itself, or how far from where it was sent."""
+    aim = record.targets[record.chosen] if truth is None else truth[:3]
+    distance = f"{100 * np.linalg.norm(record.targets[index] - aim):.1f} cm"
+    if truth is None:
+        return "" if index == record.chosen else f"alone: {distance} elsewhere"
+    return f"alone: {distance} off"
 
 
 def _bar(draw: ImageDraw.ImageDraw, place: tuple[int, int], side: int, name: str, share: float, color: Color) -> None:

@@ -14,9 +14,12 @@ from dataset_tools.page import Chapter, Exhibit, Panel
 FILM = (
     "The film",
     "Right, at every decision: each view under its heat map (bright: there). The framed view acted: weight times "
-    "certainty is largest there. The green cross is where the tool is sent, a white ring where the demonstration went. "
-    "Below, the steps in memory with the attention that each got, and how far the target would move without it.",
+    "certainty is largest there; each view also says where it alone would have sent the tool. The green cross is where "
+    "the tool is sent, a white ring where the demonstration went. Below, the steps in memory with the attention that "
+    "each got, and how far the target would move without it.",
 )
+FAR = 0.05
+"""A decision this far off the true position [m] went wrong."""
 SHEET = ("Every decision", "The same pictures as in the film, all at once.")
 
 
@@ -69,7 +72,7 @@ PANELS = (
 def chapter(episode: Explained, exhibits: Sequence[Exhibit]) -> Chapter:
     """What is to be said of ``episode``, whose pictures were written already."""
     title = f"{episode.name.capitalize()}: “{episode.instruction}”"
-    return Chapter(episode.name, title, facts(episode), [], decision_table(episode), exhibits)
+    return Chapter(episode.name, title, facts(episode), notes(episode), decision_table(episode), exhibits)
 
 
 def facts(episode: Explained) -> str:
@@ -86,6 +89,22 @@ def facts(episode: Explained) -> str:
         found.append(f"rotation: median {np.median(episode.turns):.0f} degrees off")
         found.append(f"gripper right in {right} of {len(errors)}")
     return "; ".join(found)
+
+
+def notes(episode: Explained) -> list[str]:
+    """A sentence per decision that went wrong although another view knew better."""
+    if episode.truth is None:
+        return []
+    off = np.linalg.norm(np.stack([one.targets for one in episode.records]) - episode.truth[:, None, :3], axis=2)
+    found = []
+    for index, (errors, chosen) in enumerate(zip(off, episode.chosen, strict=True)):
+        best = int(errors.argmin())
+        if errors[chosen] > FAR and errors[best] < errors[chosen] / 2:
+            found.append(
+                f"decision {index + 1}: {episode.cameras[chosen]} acted, {100 * errors[chosen]:.0f} cm off; "
+                f"{episode.cameras[best]} alone would have been {100 * errors[best]:.0f} cm off"
+            )
+    return found
 
 
 def decision_table(episode: Explained) -> str:

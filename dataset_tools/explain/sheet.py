@@ -50,8 +50,10 @@ class ExplainedFilm(Film):
         self._records = records
 
     def show(self, scene: overlay.Scene, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
-        """Append the frames of one step beside the decision that led to it."""
-        self.add(_canvas(self._records, scene.instruction), scene.step, frames)
+        """Append the frames of one step beside the decision that led to it, which is shown before the arm moves."""
+        canvas = _canvas(self._records, scene.instruction)
+        self.hold(overlay.draw_frame(canvas, frames[0], f"step {scene.step}: decided"))
+        self.add(canvas, scene.step, frames)
 
 
 def film_rows(episode: Explained, path: Path, fps: int) -> None:

@@ -14,7 +14,7 @@ from dataset_tools.figure_style import AXIS_COLORS, INK, legend_below, new_figur
 
 MOST_NUMBERS = 12
 """Decisions up to which a matrix has its numbers written in."""
-CENTIMETRE, MILLIMETRE = 100, 1000
+CENTIMETRE, MILLIMETRE, PERCENT = 100, 1000, 100
 
 
 def draw_history(episode: Explained) -> Figure:
@@ -22,12 +22,12 @@ def draw_history(episode: Explained) -> Figure:
     layers = range(len(episode.records[0].attention))
     shares = [episode.over_steps([one.attention[layer] for one in episode.records]) for layer in layers]
     moved = episode.over_steps([CENTIMETRE * one.influence for one in episode.records], back=1)
-    figure = new_figure(4.6)
+    figure = new_figure(3.9)
     grid = figure.subplots(1, len(shares) + 1, squeeze=False)[0]
     for layer, (axes, matrix) in enumerate(zip(grid, shares, strict=False)):
-        title = f"attention, layer {layer + 1}" + (" (of all that was taken, %)" if layer == 0 else " (%)")
-        _matrix(axes, 100 * matrix, title, "Blues", 100)
-    _matrix(grid[-1], moved, "target moves without the step [cm]", "Oranges", max(1.0, np.nanmax(moved, initial=0)))
+        _matrix(axes, PERCENT * matrix, f"attention in layer {layer + 1} [%]", "Blues", PERCENT)
+    most = max(1.0, float(np.nanmax(moved, initial=0)))
+    _matrix(grid[-1], moved, "target moves without the step [cm]", "Oranges", most)
     grid[0].set_ylabel("decision")
     return figure
 
@@ -45,7 +45,7 @@ def _matrix(axes: Axes, matrix: Float[np.ndarray, "n n"], title: str, colors: st
     for (row, column), value in np.ndenumerate(matrix):
         if np.isfinite(value):
             color = "white" if value > 0.6 * most else INK
-            text = f"{value:.0f}" if most == 100 else f"{value:.1f}"
+            text = f"{value:.0f}" if most == PERCENT else f"{value:.1f}"
             axes.text(column + 1, row + 1, text, ha="center", va="center", fontsize=7, color=color)
 
 

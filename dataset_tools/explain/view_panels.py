@@ -1,6 +1,7 @@
 """Pictures of the view attention over an episode: which view acted when, and what the views share."""
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -23,7 +24,7 @@ def color_of(index: int) -> str:
 
 
 def draw_weights(episode: Explained) -> Figure:
-    """The view that acted at every decision, and below them the view weights; lines mark where another view acts.
+    """The view that acted at every decision, and below them what chose it; lines mark where another view takes over.
 
     After Figure 4 of the paper.
     """
@@ -42,28 +43,30 @@ def draw_weights(episode: Explained) -> Figure:
         title = f"{index + 1}: {episode.cameras[record.chosen]}{' (changed)' if changed else ''}"
         axes.set_title(title, fontsize=9, color=INK, fontweight="bold" if changed else "normal")
         axes.spines[:].set(visible=True, linewidth=4, color=color_of(record.chosen))
-    _weight_lines(below.subplots(), episode)
+    weights, scores = below.subplots(1, 2, sharex=True)
+    _lines(weights, episode, episode.weights, "view weight")
+    _lines(scores, episode, episode.weights * episode.certainties, "weight x certainty: the largest acts")
     handles = [
         Line2D([], [], color=color_of(index), linewidth=2.5, label=camera)
         for index, camera in enumerate(episode.cameras)
     ]
-    handles.append(Line2D([], [], color=INK, marker="o", linestyle="", markersize=9, label="acts"))
-    handles.append(Line2D([], [], color=INK, linestyle=":", label="another view acts"))
+    handles.append(Line2D([], [], color=INK, marker="o", linestyle="", markersize=7, label="acts"))
+    handles.append(Line2D([], [], color=INK, linestyle=":", label="another view takes over"))
     legend_below(figure, handles)
     return figure
 
 
-def _weight_lines(axes: Axes, episode: Explained) -> None:
-    steps = np.arange(1, len(episode.records) + 1)
-    score = episode.weights * episode.certainties
-    for index in range(len(episode.cameras)):
-        axes.plot(steps, episode.weights[:, index], color=color_of(index), linewidth=2.5)
-        axes.plot(steps, score[:, index], color=color_of(index), linewidth=1, linestyle="--")
+def _lines(axes: Axes, episode: Explained, values: Float[np.ndarray, "n k"], title: str) -> None:
+    """One line per view over the decisions, with a dot where it acted."""
+    steps = np.arange(1, len(values) + 1)
+    for index, line in enumerate(values.T):
         acts = episode.chosen == index
-        axes.plot(steps[acts], episode.weights[acts, index], "o", color=color_of(index), markersize=9)
+        axes.plot(steps, line, color=color_of(index), linewidth=2)
+        axes.plot(steps[acts], line[acts], "o", color=color_of(index), markersize=7)
     for step in episode.changes:
         axes.axvline(step + 0.5, color=INK, linestyle=":", linewidth=1)
-    axes.set(xlim=(0.5, len(steps) + 0.5), ylim=(0, 1), xlabel="decision", ylabel="view weight (dashed: x certainty)")
+    axes.set(xlim=(0.5, len(steps) + 0.5), ylim=(0, 1.1 * values.max()), xlabel="decision")
+    axes.set_title(title, fontsize=10, color=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
 
@@ -84,7 +87,7 @@ def draw_information(episode: Explained) -> Figure:
             axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8, color=color)
         axes.set_title(title, fontsize=9, color=INK, fontweight="bold" if index == 0 else "normal")
         ticks = range(len(episode.cameras))
-        axes.set_xticks(ticks, episode.cameras if index == 0 else [], fontsize=7, rotation=25)
+        axes.set_xticks(ticks, episode.cameras if index == 0 else [], fontsize=7, rotation=90)
         axes.set_yticks(ticks, episode.cameras if index == 0 else [], fontsize=7)
         axes.tick_params(length=0)
     bar = figure.colorbar(picture, ax=grid, fraction=0.02)

@@ -87,7 +87,9 @@ def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
     def select_action(batch: dict[str, Any], **options: Any) -> Float[Tensor, "1 8"]:
         calls.clear()
         action = act(batch, **options)
-        records.append(record(policy, batch, action, dict(calls)))
+        noted = dict(calls)
+        calls.clear()  # what is computed from the noted calls runs the modules again
+        records.append(record(policy, batch, action, noted))
         return action
 
     policy.select_action = select_action  # type: ignore[method-assign]
