@@ -106,13 +106,21 @@ def _bar(draw: ImageDraw.ImageDraw, place: tuple[int, int], side: int, name: str
     draw.text((left + side - GAP, top - 1), f"{100 * share:.0f} %", font=font(12), fill=MUTED, anchor="ra")
 
 
+def _without_past(record: Record) -> str:
+    """What would have been decided from the present alone; empty for a decision without a past."""
+    if not len(record.influence):
+        return ""
+    opens = record.opening_without_past > 0.5
+    same = "the same" if opens == (record.opening > 0.5) else "open" if opens else "closed"
+    return f"without its past: target {100 * record.memory:.1f} cm elsewhere, gripper {same}"
+
+
 def _memory(board: Image.Image, draw: ImageDraw.ImageDraw, records: Sequence[Record], top: int) -> None:
     """The steps of the history, each as its chosen view saw it, with the attention that it got."""
     now = records[-1]
     shares = now.attention.mean(axis=0)
-    note = f"without its past the target would move by {100 * now.memory:.1f} cm" if len(shares) > 1 else ""
     draw.text((0, top), "attention over steps", font=font(14), fill=TEXT)
-    draw.text((BOARD - 1, top), note, font=font(13), fill=MUTED, anchor="ra")
+    draw.text((BOARD - 1, top), _without_past(now), font=font(13), fill=MUTED, anchor="ra")
     column = BOARD // max(6, len(shares))
     for index, (share, past) in enumerate(zip(shares, records[-len(shares) :], strict=True)):
         left, below = index * column, top + LINE + 4

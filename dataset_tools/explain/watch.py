@@ -44,6 +44,8 @@ class Record:
         attention: share of each step in what this step took, per layer of the history transformer; rows sum to 1.
         influence: how far the target would have moved without each past step [m], none for this step itself.
         memory: how far without all of them [m].
+        opening: probability with which the gripper shall be open.
+        opening_without_past: the same without all past steps.
         action: target position [m], quaternion wxyz, gripper (1 open, 0 closed).
     """
 
@@ -58,6 +60,8 @@ class Record:
     attention: Float[np.ndarray, "layers t"]
     influence: Float[np.ndarray, " past"]
     memory: float
+    opening: float
+    opening_without_past: float
     action: Float[np.ndarray, " 8"]
 
 
@@ -117,19 +121,22 @@ def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1
         step_shares(attention_weights(layer, *call.inputs), steps)[0, -1]
         for layer, call in zip(policy.net.history.layers, calls["layers"], strict=True)
     ]
-    past = range(steps - 1)
+    past, chosen = range(steps - 1), _best(weights, predicted)
+    memory, opening = _without(policy.net, calls, past)
     return Record(
         views=_camera_views(policy, batch),
         tool=_array(read_window(batch, policy.config.cameras).tool[0]),
         weights=_array(weights[0]),
         certainties=_array(predicted.certainty),
-        chosen=_best(weights, predicted),
+        chosen=chosen,
         heat=_array(predicted.log_heat.exp()),
         targets=_array(predicted.position),
         information=_array(information[0]),
         attention=_array(torch.stack(attention)),
-        influence=np.array([_moved(policy.net, calls, [step]) for step in past]),
-        memory=_moved(policy.net, calls, past),
+        influence=np.array([_without(policy.net, calls, [step])[0] for step in past]),
+        memory=memory,
+        opening=_opening(predicted, chosen),
+        opening_without_past=opening,
         action=_array(action[0]),
     )
 
@@ -138,17 +145,22 @@ def _best(weights: Float[Tensor, "1 k"], predicted: Prediction) -> int:
     return int((weights[0] * predicted.certainty).argmax())
 
 
-def _moved(net: HistMVNet, calls: Calls, steps: Sequence[int]) -> float:
-    """How far the target moves [m] when the history transformer does not see ``steps`` of its window."""
+def _opening(predicted: Prediction, view: int) -> float:
+    return float(predicted.gripper[view].sigmoid())
+
+
+def _without(net: HistMVNet, calls: Calls, steps: Sequence[int]) -> tuple[float, float]:
+    """How far the target moves [m], and the probability of "open", if the history does not see ``steps`` of its window.
+
+    The cached steps themselves stay as they were encoded: what is hidden is hidden from the history transformer.
+    """
     (views,), (history,), (decoder,) = calls["views"], calls["history"], calls["decoder"]
-    if not steps:
-        return 0.0
     with forgotten(net.history, steps, history.inputs[0].shape[1]):
         enriched = net.history(*history.inputs)[:, -1]
     predicted = net.decoder(enriched.expand_as(decoder.inputs[0]), *decoder.inputs[1:])
-    weights, before = views.output, decoder.output
-    now, then = predicted.position[_best(weights, predicted)], before.position[_best(weights, before)]
-    return float((now - then).norm())
+    best = _best(views.output, predicted)
+    before = decoder.output.position[_best(views.output, decoder.output)]
+    return float((predicted.position[best] - before).norm()), _opening(predicted, best)
 
 
 def _camera_views(policy: HistMVPolicy, batch: dict[str, Any]) -> dict[str, CameraView]:
