@@ -4,7 +4,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from lerobot.configs import parser
 from lerobot.envs.configs import EnvConfig
@@ -17,10 +16,25 @@ REPORTED_SEEDS = 200_000
 """First seed of reported evaluations: neither recordings nor evaluations during training use seeds from here on."""
 
 
-class WithPolicy(Protocol):
-    """A configuration that names a policy."""
+@dataclass(kw_only=True)
+class PolicyCommand:
+    """Options of a command that runs a policy."""
 
-    policy: PolicySource
+    policy: PolicySource = field(default_factory=PolicySource)
+
+    @classmethod
+    def parse(cls, args: Sequence[str], prog: str) -> "PolicyCommand":
+        """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
+        register_third_party_plugins()
+        arguments = list(args)
+        if {"-h", "--help"} & set(arguments):
+            parser.print_scoped_help(cls, arguments)
+            sys.exit(0)
+        path = parser.get_path_arg("policy", arguments)
+        overrides = parser.get_cli_overrides("policy", arguments) or []
+        config: PolicyCommand = command_line.parse(cls, parser.filter_path_args("policy", arguments), prog)
+        config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
+        return config
 
 
 @dataclass
@@ -36,12 +50,11 @@ class ScenesConfig:
 
 
 @dataclass
-class EvaluateConfig:
+class EvaluateConfig(PolicyCommand):
     """Evaluate a checkpoint: histmv eval --policy.path=CHECKPOINT --env.type=ur5 --env.task=pick_and_lift."""
 
     # the environment: --env.type=ur5 and its options, such as --env.task=reach_target,pick_and_lift
     env: EnvConfig
-    policy: PolicySource = field(default_factory=PolicySource)
     eval: ScenesConfig = field(default_factory=ScenesConfig)
     # seed of the first scene, the others follow; recordings use seeds below 100000, training evaluates below 200000
     seed: int = REPORTED_SEEDS
@@ -59,22 +72,3 @@ class EvaluateConfig:
         ):
             if value < least:
                 raise ValueError(f"{name}={value} must be at least {least}")
-
-    @classmethod
-    def parse(cls, args: Sequence[str], prog: str) -> "EvaluateConfig":
-        """The configuration that a command line describes."""
-        return parse_with_policy(cls, args, prog)
-
-
-def parse_with_policy[Config: WithPolicy](config_class: type[Config], args: Sequence[str], prog: str) -> Config:
-    """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
-    register_third_party_plugins()
-    arguments = list(args)
-    if {"-h", "--help"} & set(arguments):
-        parser.print_scoped_help(config_class, arguments)
-        sys.exit(0)
-    path = parser.get_path_arg("policy", arguments)
-    overrides = parser.get_cli_overrides("policy", arguments) or []
-    config: Config = command_line.parse(config_class, parser.filter_path_args("policy", arguments), prog)
-    config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
-    return config

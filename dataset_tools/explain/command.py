@@ -1,6 +1,6 @@
 """``histmv explain``: why a policy acted as it did, decision by decision, as a film, pictures and one page."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -9,8 +9,8 @@ from lerobot.envs.configs import EnvConfig
 from rich.console import Console
 from rich.progress import Progress
 
-from dataset_tools.eval_checkpoint import PolicySource, check_fits, load_config
-from dataset_tools.eval_settings import REPORTED_SEEDS, parse_with_policy
+from dataset_tools.eval_checkpoint import check_fits, load_config
+from dataset_tools.eval_settings import REPORTED_SEEDS, PolicyCommand
 from dataset_tools.explain.chapter import FILM, PANELS, SHEET, chapter
 from dataset_tools.explain.episode import Explained
 from dataset_tools.explain.sheet import draw_sheet
@@ -36,7 +36,7 @@ class ExplainedDataset:
 
 
 @dataclass
-class ExplainConfig:
+class ExplainConfig(PolicyCommand):
     """Show what a policy looked at: heat maps, view weights, shared information, attention over steps, poses.
 
         histmv explain --policy.path=CHECKPOINT --dataset.repo_id=me/keys --dataset.root=data/keys --episode=3
@@ -45,7 +45,6 @@ class ExplainConfig:
     writes a film, PNG files and explanation.html, which holds all of them.
     """
 
-    policy: PolicySource = field(default_factory=PolicySource)
     # either: an episode of a keyframed dataset, at each of whose rows the policy decides
     dataset: ExplainedDataset = field(default_factory=ExplainedDataset)
     # episode of the dataset
@@ -65,11 +64,6 @@ class ExplainConfig:
                 "explain needs one source of an episode: --dataset.repo_id=me/keys --episode=N, or "
                 "--env.type=ur5 --env.task=TASK --seed=N"
             )
-
-    @classmethod
-    def parse(cls, args: Sequence[str], prog: str) -> "ExplainConfig":
-        """The configuration that a command line describes."""
-        return parse_with_policy(cls, args, prog)
 
     @property
     def task(self) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,7 +14,7 @@ from dataset_tools.figure_style import AXIS_COLORS, INK, legend_below, new_figur
 
 MOST_NUMBERS = 12
 """Decisions up to which a matrix has its numbers written in."""
-CENTIMETRE, MILLIMETRE, PERCENT = 100, 1000, 100
+CENTIMETRE, MILLIMETRE, PERCENT = 100.0, 1000.0, 100.0
 
 
 def draw_history(episode: Explained) -> Figure:
@@ -88,7 +88,7 @@ def compared(episode: Explained) -> tuple[Float[np.ndarray, "m 3"], str]:
     return np.array(reached).reshape(-1, 3), "reached"
 
 
-def _bars(axes: Axes, steps: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"], label: str) -> None:
+def _bars(axes: Axes, steps: Int[np.ndarray, " m"], values: Float[np.ndarray, " m"], label: str) -> None:
     axes.bar(steps, values, color=INK, width=0.5)
     for step, value in zip(steps, values, strict=True):
         axes.annotate(f"{value:.0f}", (step, value), (0, 2), textcoords="offset points", ha="center", fontsize=8)
