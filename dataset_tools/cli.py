@@ -53,6 +53,10 @@ COMMANDS = {
         "dataset_tools.inspect.command", "draw episodes: path, keyframes, errors, tool in every view, cloud"
     ),
     "eval": Command("dataset_tools.evaluate", "success of a checkpoint over unseen scenes, with intervals and videos"),
+    "explain": Command(
+        "dataset_tools.explain.command",
+        "why a checkpoint acted as it did: heat maps, view weights, attention over steps",
+    ),
     "demo": Command("dataset_tools.demo", "record, keyframe, train and evaluate on one task, and show the result"),
     "report": Command("dataset_tools.demo_report", "the one-page report of a demo directory, written again"),
     "configs": Command(

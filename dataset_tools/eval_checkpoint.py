@@ -123,25 +123,54 @@ def fingerprint(config: PreTrainedConfig) -> dict[str, Any]:
 
 
 @dataclass
-class Pilot:
-    """A policy and all processors between it and a vector environment."""
+class Actor:
+    """A policy and the processors that were saved with it."""
 
     policy: PreTrainedPolicy
     before_policy: Any
     after_policy: Any
+
+    @classmethod
+    def load(cls, config: PreTrainedConfig) -> "Actor":
+        """Load the checkpoint that ``config.pretrained_path`` names."""
+        before, after = make_pre_post_processors(
+            config,
+            str(config.pretrained_path),
+            preprocessor_overrides={"device_processor": {"device": str(config.device)}},
+        )
+        return cls(load_policy(config), before, after)
+
+    def act(self, batch: dict[str, Any]) -> tuple[Float[Tensor, "b a"], float]:
+        """Actions for a batch of observations, and the time that ``select_action`` took [s]."""
+        batch = self.before_policy(batch)
+        device = torch.device(self.policy.config.device)
+        precision = torch.autocast(device.type) if self.policy.config.use_amp else nullcontext()
+        with torch.inference_mode(), precision:
+            started = time.perf_counter()
+            action = self.policy.select_action(batch)
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            seconds = time.perf_counter() - started
+        return self.after_policy(action), seconds
+
+
+@dataclass
+class Pilot:
+    """A policy and all processors between it and a vector environment."""
+
+    actor: Actor
     before_env: Any
     after_env: Any
 
     @classmethod
     def load(cls, config: PreTrainedConfig, env: EnvConfig) -> "Pilot":
         """Load the checkpoint that ``config.pretrained_path`` names."""
-        policy = load_policy(config)
-        before, after = make_pre_post_processors(
-            config,
-            str(config.pretrained_path),
-            preprocessor_overrides={"device_processor": {"device": str(config.device)}},
-        )
-        return cls(policy, before, after, *make_env_pre_post_processors(env_cfg=env, policy_cfg=config))
+        return cls(Actor.load(config), *make_env_pre_post_processors(env_cfg=env, policy_cfg=config))
+
+    @property
+    def policy(self) -> PreTrainedPolicy:
+        """The policy itself."""
+        return self.actor.policy
 
     def decide(
         self, observation: dict[str, Any], instructions: Sequence[str], running: Sequence[int]
@@ -159,14 +188,5 @@ class Pilot:
         batch = preprocess_observation(observation)
         batch = {key: value[rows] if isinstance(value, Tensor) else value for key, value in batch.items()}
         batch["task"] = [instructions[row] for row in rows]
-        batch = self.before_policy(self.before_env(batch))
-        device = torch.device(self.policy.config.device)
-        precision = torch.autocast(device.type) if self.policy.config.use_amp else nullcontext()
-        with torch.inference_mode(), precision:
-            started = time.perf_counter()
-            action = self.policy.select_action(batch)
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            seconds = time.perf_counter() - started
-        action = self.after_env({ACTION: self.after_policy(action)})[ACTION]
-        return action.cpu().numpy(), seconds
+        action, seconds = self.actor.act(self.before_env(batch))
+        return self.after_env({ACTION: action})[ACTION].cpu().numpy(), seconds

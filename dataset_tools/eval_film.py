@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 from lerobot.policies import PreTrainedPolicy
+from PIL import Image
 
 from dataset_tools import overlay
 from dataset_tools.video import VideoWriter
@@ -32,11 +33,15 @@ class Film:
 
     def show(self, scene: overlay.Scene, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
         """Append the frames of one step under the decision that led to it."""
-        self._canvas = overlay.draw_scene(scene)
+        self.add(overlay.draw_scene(scene), scene.step, frames)
+
+    def add(self, canvas: Image.Image, step: int, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
+        """Append the frames of one step on the ``canvas`` that was drawn of its decision."""
+        self._canvas = canvas
         for frame in frames:
             self._frames += 1
             self._last = frame
-            status = f"step {scene.step}     {self._seconds():.1f} s"
+            status = f"step {step}     {self._seconds():.1f} s"
             self._writer.add(overlay.draw_frame(self._canvas, frame, status))
 
     def finish(self, failure: str, success: bool) -> None:
@@ -45,9 +50,13 @@ class Film:
         outcome = "success" if success else f"failed: {failure}"
         color = overlay.SUCCESS if success else overlay.FAILURE
         picture = overlay.draw_frame(self._canvas, self._last, f"{outcome}     {self._seconds():.1f} s", color)
+        self.hold(picture)
+        self._writer.close()
+
+    def hold(self, picture: UInt8[np.ndarray, "y x 3"]) -> None:
+        """Append a whole frame that stays for a while, so that it can be read."""
         for _ in range(round(HOLD_SECONDS * self.fps)):
             self._writer.add(picture)
-        self._writer.close()
 
     def abandon(self) -> None:
         """Delete the unfinished file."""

@@ -5,7 +5,7 @@ policy's memory is its own, and rows influence each other only by floating-point
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -69,10 +69,18 @@ class Rollout:
         seeds: scenes.
         videos: seed -> path below ``output``, for the episodes to film.
         output: folder of the evaluation.
+        film: makes the film of an episode from its path and its frames per second.
     """
 
     def __init__(
-        self, envs: Scenes, pilot: Pilot, task: str, seeds: Sequence[int], videos: Mapping[int, str], output: Path
+        self,
+        envs: Scenes,
+        pilot: Pilot,
+        task: str,
+        seeds: Sequence[int],
+        videos: Mapping[int, str],
+        output: Path,
+        film: Callable[[Path, int], Film] = Film,
     ) -> None:
         self.envs, self.pilot, self.task, self.videos = envs, pilot, task, videos
         self.mark = time.perf_counter()
@@ -81,7 +89,7 @@ class Rollout:
         self.observation, _ = envs.reset(seed=list(seeds), options={NEW_ROLLOUT_OPTION: True})
         self.limit = max(envs.call("_max_episode_steps"))
         fps = int(envs.metadata["render_fps"])
-        films = [Film(output / videos[seed], fps) if seed in videos else None for seed in seeds]
+        films = [film(output / videos[seed], fps) if seed in videos else None for seed in seeds]
         told = envs.call("task_description")
         self.runs = [Run(seed, text, film) for seed, text, film in zip(seeds, told, films, strict=True)]
         self.running = list(range(len(seeds)))

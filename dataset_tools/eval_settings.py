@@ -16,6 +16,27 @@ REPORTED_SEEDS = 200_000
 """First seed of reported evaluations: neither recordings nor evaluations during training use seeds from here on."""
 
 
+@dataclass(kw_only=True)
+class PolicyCommand:
+    """Options of a command that runs a policy."""
+
+    policy: PolicySource = field(default_factory=PolicySource)
+
+    @classmethod
+    def parse(cls, args: Sequence[str], prog: str) -> "PolicyCommand":
+        """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
+        register_third_party_plugins()
+        arguments = list(args)
+        if {"-h", "--help"} & set(arguments):
+            parser.print_scoped_help(cls, arguments)
+            sys.exit(0)
+        path = parser.get_path_arg("policy", arguments)
+        overrides = parser.get_cli_overrides("policy", arguments) or []
+        config: PolicyCommand = command_line.parse(cls, parser.filter_path_args("policy", arguments), prog)
+        config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
+        return config
+
+
 @dataclass
 class ScenesConfig:
     """How many scenes, and how many at a time."""
@@ -29,12 +50,11 @@ class ScenesConfig:
 
 
 @dataclass
-class EvaluateConfig:
+class EvaluateConfig(PolicyCommand):
     """Evaluate a checkpoint: histmv eval --policy.path=CHECKPOINT --env.type=ur5 --env.task=pick_and_lift."""
 
     # the environment: --env.type=ur5 and its options, such as --env.task=reach_target,pick_and_lift
     env: EnvConfig
-    policy: PolicySource = field(default_factory=PolicySource)
     eval: ScenesConfig = field(default_factory=ScenesConfig)
     # seed of the first scene, the others follow; recordings use seeds below 100000, training evaluates below 200000
     seed: int = REPORTED_SEEDS
@@ -52,17 +72,3 @@ class EvaluateConfig:
         ):
             if value < least:
                 raise ValueError(f"{name}={value} must be at least {least}")
-
-    @classmethod
-    def parse(cls, args: Sequence[str], prog: str) -> "EvaluateConfig":
-        """The configuration that a command line describes; ``--policy.NAME=`` sets any option of the policy."""
-        register_third_party_plugins()
-        arguments = list(args)
-        if {"-h", "--help"} & set(arguments):
-            parser.print_scoped_help(cls, arguments)
-            sys.exit(0)
-        path = parser.get_path_arg("policy", arguments)
-        overrides = parser.get_cli_overrides("policy", arguments) or []
-        config: EvaluateConfig = command_line.parse(cls, parser.filter_path_args("policy", arguments), prog)
-        config.policy = PolicySource(path or config.policy.path, [*config.policy.overrides, *overrides])
-        return config

@@ -30,6 +30,7 @@ TEXT: Color = (232, 234, 240)
 MUTED: Color = (150, 156, 170)
 CHOSEN: Color = (255, 176, 32)
 TARGET: Color = (64, 255, 160)
+TRUTH: Color = (255, 255, 255)
 SUCCESS: Color = (64, 200, 110)
 FAILURE: Color = (235, 84, 84)
 HEAT_OPACITY = 0.8
@@ -44,12 +45,14 @@ class View:
         image: what it saw.
         weight: its share w; None when the policy weighs no views.
         target: column and row [pixels] at which it sees the predicted target; NaN when behind it.
+        truth: the same of the target that a demonstration went to; None when there is none.
     """
 
     camera: str
     image: UInt8[np.ndarray, "y x 3"]
     weight: float | None = None
     target: Float[np.ndarray, " 2"] | None = None
+    truth: Float[np.ndarray, " 2"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +98,18 @@ def blend_heat(image: UInt8[np.ndarray, "y x 3"], heat: Float[np.ndarray, "y x"]
     return (0.7 * image * (1 - opacity) + colours * opacity).astype(np.uint8)
 
 
-def _tile(view: View, side: int, heat: Float[np.ndarray, "y x"] | None, chosen: bool) -> Image.Image:
+def draw_tile(view: View, side: int, heat: Float[np.ndarray, "y x"] | None, chosen: bool) -> Image.Image:
+    """A view on a square of ``side`` pixels: under its heat map, with its target and truth, framed if chosen."""
     image = view.image if heat is None else blend_heat(view.image, heat)
     tile = resized(image, side)
     draw = ImageDraw.Draw(tile)
     rows, columns = image.shape[:2]
+    scale = side / max(rows, columns)
+    inset = (side - scale * np.array([columns, rows])) / 2
+    if view.truth is not None and np.isfinite(view.truth).all():
+        u, v = (view.truth + 0.5) * scale + inset
+        draw.ellipse((u - 6, v - 6, u + 6, v + 6), outline=TRUTH, width=2)
     if view.target is not None and np.isfinite(view.target).all():
-        scale = side / max(rows, columns)
-        inset = (side - scale * np.array([columns, rows])) / 2
         u, v = (view.target + 0.5) * scale + inset
         for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             draw.line((u + 4 * du, v + 4 * dv, u + 10 * du, v + 10 * dv), fill=TARGET, width=2)
@@ -132,9 +139,9 @@ def draw_scene(scene: Scene) -> Image.Image:
     for index, view in enumerate(scene.views):
         chosen = index == scene.chosen
         left, top = MAIN + 2 * GAP, GAP + index * (side + GAP)
-        canvas.paste(_tile(view, side, scene.heat if chosen else None, chosen), (left, top))
+        canvas.paste(draw_tile(view, side, scene.heat if chosen else None, chosen), (left, top))
         _bar(draw, left + side + 2 * GAP, top + 4, view, chosen)
-    draw.text((2 * GAP, MAIN + 3 * GAP), _fitting(scene.instruction, 18, WIDTH - 4 * GAP), font=font(18), fill=TEXT)
+    draw.text((2 * GAP, MAIN + 3 * GAP), fitting(scene.instruction, 18, WIDTH - 4 * GAP), font=font(18), fill=TEXT)
     return canvas
 
 
@@ -151,7 +158,7 @@ def draw_frame(
     return np.asarray(picture)
 
 
-def _fitting(text: str, size: int, width: int) -> str:
+def fitting(text: str, size: int, width: int) -> str:
     """``text``, cut at the end so that it fits into ``width`` pixels."""
     typeface = font(size)
     if typeface.getlength(text) <= width:

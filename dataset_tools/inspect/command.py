@@ -8,14 +8,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from dataset_tools.demonstrations import understand
-from dataset_tools.figure_style import DPI
+from dataset_tools.inspect.chapter import chapter
 from dataset_tools.inspect.dense import dense_episodes
 from dataset_tools.inspect.episodes import Episode
 from dataset_tools.inspect.keyframed import Making, keyframed_episodes, origin_of, read_making
-from dataset_tools.inspect.page import Chapter, page
 from dataset_tools.inspect.panels import PANELS, left_out
 from dataset_tools.inspect.rerun import require_rerun, write_recording
 from dataset_tools.keyframe import KeyframingConfig, SourceConfig
+from dataset_tools.page import Chapter, draw_panels, page
 from dataset_tools.published import check_free, published
 from dataset_tools.signals import Trajectory
 from dataset_tools.source import Source, open_dataset, open_source
@@ -82,9 +82,9 @@ def run(config: InspectConfig) -> None:
         drawn = f"{len(chapters)} of {source.meta.total_episodes} episodes"
         kind = "keyframed" if source.is_keyframed else "dense"
         (partial / PAGE).write_text(page(told.repo_id, f"{kind} dataset; {drawn}", chapters), encoding="utf-8")
-    for chapter in chapters:
-        console.print(f"episode {chapter.number}: {chapter.facts}", soft_wrap=True, markup=False)
-    for note in dict.fromkeys(note for chapter in chapters for note in chapter.notes):
+    for one in chapters:
+        console.print(f"{one.name}: {one.facts}", soft_wrap=True, markup=False)
+    for note in dict.fromkeys(note for one in chapters for note in one.notes):
         console.print(f"note: {note}", soft_wrap=True, markup=False)
     console.print(f"written to {root}: open {root / PAGE}", soft_wrap=True, markup=False)
 
@@ -96,12 +96,8 @@ def stem(episode: Episode) -> str:
 
 def draw_episode(episode: Episode, folder: Path) -> Chapter:
     """Write the pictures of one episode that it has the data for."""
-    pictures = {}
-    for panel in PANELS:
-        if not panel.lacking(episode):
-            pictures[panel.name] = folder / f"{stem(episode)}_{panel.name}.png"
-            panel.draw(episode).savefig(pictures[panel.name], dpi=DPI)
-    return Chapter.of(episode, [*episode.notes, *left_out(episode)], pictures)
+    exhibits = draw_panels(PANELS, episode, folder, stem(episode))
+    return chapter(episode, [*episode.notes, *left_out(episode)], exhibits)
 
 
 def read_episodes(source: Source, config: InspectConfig) -> Iterator[Episode]:

@@ -1,8 +1,5 @@
 """The pictures of an episode, one after the other: what each shows, and what an episode must have for it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from matplotlib.figure import Figure
 
 from dataset_tools import demo_figures
@@ -10,26 +7,8 @@ from dataset_tools.inspect.cloud import draw_cloud
 from dataset_tools.inspect.episodes import Episode
 from dataset_tools.inspect.paths import draw_errors, draw_trajectory
 from dataset_tools.inspect.views import draw_projections
+from dataset_tools.page import Panel
 from lerobot_histmv import keys
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One picture.
-
-    Attributes:
-        name: end of its file's name.
-        title: what it is.
-        caption: how to read it.
-        lacking: what an episode lacks for it; empty if it can be drawn.
-        draw: the picture itself, only called if nothing is lacking.
-    """
-
-    name: str
-    title: str
-    caption: str
-    lacking: Callable[[Episode], str]
-    draw: Callable[[Episode], Figure]
 
 
 def keyframe_sheet(episode: Episode) -> Figure:

@@ -18,6 +18,7 @@ from dataset_tools.inspect.panels import PANELS, left_out
 from dataset_tools.inspect.rerun import require_rerun, write_recording
 from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig
 from dataset_tools.keyframe import run as run_keyframe
+from dataset_tools.page import Chapter, page
 from dataset_tools.source import open_dataset
 from lerobot_histmv import keys
 
@@ -165,9 +166,8 @@ def test_a_source_root_makes_no_sense_for_a_dense_dataset(dense: Path) -> None:
 
 
 def test_text_of_the_dataset_cannot_become_markup(dense: Path) -> None:
-    from dataset_tools.inspect.page import Chapter, page
-
-    text = page("<b>", "&", [Chapter(0, "<script>alert(1)</script>", "", ["<img src=http://x>"], "", {})])
+    bad = "<script>alert(1)</script>"
+    text = page("<b>", "&", [Chapter("episode 0", bad, bad, ["<img src=http://x>"], "", [])])
     assert_self_contained(text, 0)
 
 

@@ -4,12 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from tiny_dataset import write_dataset
 from tiny_policy import CAMERAS, STATE_SIZE, TASK, episode
 from tiny_scene import SIZE, tiny_network
 
@@ -21,45 +21,10 @@ from lerobot_histmv.windows import choose_rows, row_weights
 REPO, LENGTHS, PAST_STEPS = "local/tiny", (1, 3, 5), 2
 
 
-def features() -> dict[str, dict[str, Any]]:
-    """A keyframed dataset's features for two cameras."""
-    state = [*keys.POSE_NAMES, *(f"joint_{i}.pos" for i in range(STATE_SIZE - len(keys.POSE_NAMES)))]
-    named = {
-        keys.STATE: state,
-        keys.ACTION: list(keys.POSE_NAMES),
-        keys.INTRINSICS: keys.intrinsics_names(CAMERAS),
-        keys.EXTRINSICS: keys.extrinsics_names(CAMERAS),
-    }
-    found: dict[str, dict[str, Any]] = {
-        key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in named.items()
-    }
-    axes = ["height", "width", "channels"]
-    for camera in CAMERAS:
-        found[keys.rgb_key(camera)] = {"dtype": "image", "shape": (*SIZE, 3), "names": axes}
-        depth = {"dtype": "image", "shape": (*SIZE, 1), "names": axes, "info": {"is_depth_map": True}}
-        found[keys.depth_key(camera)] = depth
-    return found
-
-
-def frame(rows: dict[str, torch.Tensor], step: int) -> dict[str, Any]:
-    """One row as LeRobot's writer wants it: channels last, depth in whole millimetres."""
-    values = {key: rows[key][step].numpy() for key in features()}
-    for camera in CAMERAS:
-        for key, dtype, factor in ((keys.rgb_key(camera), np.uint8, 255), (keys.depth_key(camera), np.uint16, 1)):
-            values[key] = (factor * values[key]).round().astype(dtype).transpose(1, 2, 0)
-    return values | {"task": TASK}
-
-
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("datasets") / "tiny"
-    dataset = LeRobotDataset.create(REPO, fps=1, features=features(), root=folder, use_videos=False)
-    for number, length in enumerate(LENGTHS):
-        rows = episode(length, seed=number)
-        for step in range(length):
-            dataset.add_frame(frame(rows, step))
-        dataset.save_episode()
-    dataset.finalize()
+    write_dataset(folder, REPO, LENGTHS)
     (folder / keys.INSTRUCTIONS_FILE).write_text(json.dumps({TASK: ["lift the red cube"]}))
     return folder
 

@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import UInt8
 
 from dataset_tools import overlay
-from dataset_tools.overlay import CHOSEN, GAP, MAIN, TARGET, TILE, Scene, View
+from dataset_tools.overlay import CHOSEN, GAP, MAIN, TARGET, TILE, TRUTH, Scene, View
 from dataset_tools.video import VideoWriter
 
 GREY = np.full((61, 61, 3), 90, np.uint8)
@@ -53,6 +53,13 @@ def test_target_crosses_surround_its_pixel_and_vanish_behind_the_camera() -> Non
     assert rows.mean() * 61 / TILE == pytest.approx(12.5, abs=1)
     assert columns.mean() * 61 / TILE == pytest.approx(30.5, abs=1)
     assert not (tile(canvas, 1) == TARGET).all(axis=-1).any()
+
+
+def test_the_true_target_is_ringed_where_a_view_sees_it() -> None:
+    seen = View("front", GREY, truth=np.array([30.0, 12.0]))
+    rows, columns = np.nonzero((np.asarray(overlay.draw_tile(seen, 61, None, False)) == TRUTH).all(axis=-1))
+    assert rows.mean() == pytest.approx(12.5, abs=1)
+    assert columns.mean() == pytest.approx(30.5, abs=1)
 
 
 def test_long_instructions_are_cut_to_the_picture() -> None:
