@@ -14,7 +14,7 @@ class TextureConfig:
     """Local texture features (paper 3.2).
 
     Args:
-        encoder: "panet" (the backbone and a PANet neck), "backbone" (the backbone alone: a plain convolutional encoder) or
+        encoder: "panet" (backbone and PANet neck), "backbone" (the backbone alone: a plain convolutional encoder) or
             "none" (no texture: of the colours only the global vector is left).
         backbone: "plain" (four stride-2 stages) or the name of a timm model that supports ``features_only``.
         widths: channels of the plain backbone's stages, at strides 2, 4, 8 and 16.
@@ -43,8 +43,8 @@ class SemanticsConfig:
     """Global semantic vectors of images and instructions (paper 3.2, 3.4).
 
     Args:
-        image: which tower gives the views' global vectors: "clip", "r3m" (a ResNet of Nair et al. 2022, frozen, as in the
-            comparison of paper table 1) or "none".
+        image: which tower gives the views' global vectors: "clip", "r3m" (the frozen ResNet of Nair et al. 2022, as in
+            the comparison of paper table 1) or "none".
         r3m_pretrained: R3M checkpoint file of image="r3m"; the ResNet's depth (18, 34 or 50) is read from it.
         clip_model: "tiny" (our small architecture, trained with the policy) or any open_clip model name.
         clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights. OpenAI's own
@@ -104,15 +104,15 @@ class ViewConfig:
     """Mutual-information view attention (paper 3.3).
 
     Args:
-        fusion: what history sees of a step: "attention" (the views' sum weighted by w), "mean" (the mean of the views that
-            show something) or "tokens" (every view's tokens, as in Hiveformer). Only "attention" has weights and L_MI.
+        fusion: what history sees of a step: "attention" (the views' sum weighted by w), "mean" (the mean of the views
+            that show something) or "tokens" (every view's tokens, as in Hiveformer). Only "attention" has w and L_MI.
         decode: "one" (the heat map lies over one view) or "all" (one softmax over the pixels of all views).
         act: with decode="one", which view acts: the one of largest "weight" (as printed), or of largest weight times
             "certainty".
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
         mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
-        train_choice: with decode="one", which views are decoded in training: "argmax"; "sampled" from w; "expected" (all, weighted by w);
-            "ranked" (all, mostly those that decode a step well; w learns to rank them).
+        train_choice: with decode="one", which views are decoded in training: "argmax"; "sampled" from w; "expected"
+            (all, weighted by w); "ranked" (all, mostly those that decode a step well; w learns to rank them).
     """
 
     fusion: str = "attention"

@@ -29,8 +29,8 @@ class Prediction:
         surface: heat map's expectation over the cloud, the position without its offset [m].
         quaternion: w, x, y, z, unit.
         gripper: logit of "open".
-        log_heat: log-probabilities over the pixels of the view, or of all views one below the other; -inf where the cloud
-            is invalid.
+        log_heat: log-probabilities over the pixels of the view, or of all views one below the other; -inf where the
+            cloud is invalid.
         certainty: share of the heat near its peak when the policy acts; 1 in training, which does not ask.
     """
 
@@ -117,8 +117,8 @@ class PositionDecoder(nn.Module):
 class PoseDecoder(nn.Module):
     """Two convolutions, pooling and two dense layers: offset, quaternion, gripper and, with ``ray``, depth.
 
-    Beside the paper's pooled map, the dense layers see with ``local`` the decoded map where the heat map points: the turn
-    of an object and the way from its surface to its centre are local.
+    Beside the paper's pooled map, the dense layers see with ``local`` the decoded map where the heat map points: the
+    turn of an object and the way from its surface to its centre are local.
     """
 
     def __init__(self, width: int, config: DecoderConfig) -> None:
@@ -203,8 +203,8 @@ class Decoder(nn.Module):
     ) -> tuple[Prediction, Float[Tensor, "n k"]]:
         """Decode all views of each step with one softmax over the pixels of all; also each view's share of the heat.
 
-        The views' pixels lie one below the other, as in a single tall image. Where the second decoder needs one view, it
-        gets the mean of all, weighted by their shares. Arguments as in ``forward``, of every view.
+        The views' pixels lie one below the other, as in a single tall image. Where the second decoder needs one view,
+        it gets the mean of all, weighted by their shares. Arguments as in ``forward``, of every view.
         """
         k = maps.shape[1]
         size = (cloud.shape[-2], cloud.shape[-1])

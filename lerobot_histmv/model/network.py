@@ -172,8 +172,9 @@ class HistMVNet(nn.Module):
     ) -> tuple[Prediction, Int[Tensor, "n 2"]]:
         """Decode each step as when acting: from its best view, or from all together; and the (step, view) pairs.
 
-        The best view is that of the largest weight, or of the largest product of weight and certainty, for which all are
-        decoded: the weights know how good a view usually is; that the arm hides the target in it shows in a torn heat map.
+        The best view is that of the largest weight, or of the largest product of weight and certainty, for which all
+        are decoded: the weights know how good a view usually is; that the arm hides the target in it shows in a torn
+        heat map.
         """
         if self.config.views.decode == "all":
             return self._decode_together(encoding, enriched)
@@ -201,7 +202,7 @@ class HistMVNet(nn.Module):
         return predicted, torch.stack([steps, most_informative(shares)], dim=-1)
 
     def heat_cloud(self, encoding: Encoding, views: Int[Tensor, "m 2"]) -> Float[Tensor, "m 3 y x"]:
-        """World points [m] under the heat maps of decoded pairs: those of the pair's view, or of all views of its step."""
+        """World points [m] under the heat maps of decoded pairs: of the pair's view, or of all views of its step."""
         step, view = views.unbind(-1)
         if self.config.views.decode == "all":
             return rearrange(encoding.cloud, "n k c y x -> n c (k y) x")

@@ -35,13 +35,13 @@ def read_r3m(path: str) -> dict[str, Tensor]:
 
 
 def architecture(weights: dict[str, Tensor], path: str) -> str:
-    """timm's name of the ResNet that has these weights."""
+    """Name of the ResNet that has these weights, as timm calls it."""
     blocks = {name.split(".")[1] for name in weights if name.startswith("layer3.")}
     name = BLOCKS.get((len(blocks), "layer3.0.conv3.weight" in weights))
     if name is None:
         raise ValueError(
-            f"semantics.r3m_pretrained={path!r} holds none of R3M's networks {sorted(BLOCKS.values())}: the third stage of "
-            f"its {PREFIX}* weights has {len(blocks)} blocks"
+            f"semantics.r3m_pretrained={path!r} holds none of R3M's networks {sorted(BLOCKS.values())}: the third "
+            f"stage of its {PREFIX}* weights has {len(blocks)} blocks"
         )
     return name
 

@@ -152,8 +152,8 @@ def image_tower(config: SemanticsConfig, towers: ClipTowers | None = None) -> Cl
 class Semantics(nn.Module):
     """Semantic vectors of views and instructions.
 
-    Towers that are not trained (R3M's never is) stay outside of the module tree: their weights come from the package, cache or file that
-    the configuration names, and are not written into every checkpoint.
+    Towers that are not trained (R3M's never is) stay outside of the module tree: their weights come from the package,
+    cache or file that the configuration names, and are not written into every checkpoint.
     """
 
     def __init__(self, config: SemanticsConfig) -> None:
