@@ -1,4 +1,4 @@
-"""``histmv cache-clip``: a dataset again, with the frozen CLIP or R3M vector of every colour image as further columns."""
+"""``histmv cache-clip``: a dataset again, with a frozen tower's vector of every colour image as further columns."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -27,11 +27,11 @@ BATCH = 32
 
 @dataclass
 class CacheClipConfig:
-    """Write a keyframed dataset again, with the vector that a frozen CLIP gives of every colour image.
+    """Write a keyframed dataset again, with the vector that a frozen CLIP (or R3M) gives of every colour image.
 
         histmv cache-clip --dataset.repo_id=me/keys --output.repo_id=me/keys_clip --clip_model=ViT-B-32
 
-    Training with the same --policy.network.semantics.clip_model and clip_pretrained then never runs CLIP. The columns'
+    Training with the same --policy.network.semantics.* then never runs the tower on images. The columns'
     names hold a fingerprint of weights and preprocessing: a policy with others does not take them and runs its own. The
     vectors are those of the images as recorded; augmentation does not reach them.
     """
@@ -65,7 +65,12 @@ def run(config: CacheClipConfig) -> None:
     source = open_dataset(given.repo_id, given.root, None, given.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    told = SemanticsConfig(config.image, config.r3m_pretrained, config.clip_model, config.clip_pretrained)
+    told = SemanticsConfig(
+        image=config.image,
+        r3m_pretrained=config.r3m_pretrained,
+        clip_model=config.clip_model,
+        clip_pretrained=config.clip_pretrained,
+    )
     place = Workplace(root, {"source": str(source.root), **asdict(told)}, config.overwrite, "encoded")
     place.check_free()
     towers = image_tower(told)

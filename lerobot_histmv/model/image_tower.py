@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from einops import rearrange
 from jaxtyping import Float
+from open_clip.transformer import QuickGELU
 from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
@@ -55,6 +56,8 @@ class ImageTower(nn.Module):
     def fingerprint(self) -> str:
         """Tells towers whose ``images`` differ: a digest of the image network's weights and of the preprocessing."""
         told = [PREPROCESSING, self.size, self.mean.flatten().tolist(), self.std.flatten().tolist()]
+        if any(isinstance(module, QuickGELU) for module in self.network.modules()):
+            told.append(QuickGELU.__name__)  # the same weights give other vectors
         digest = hashlib.sha256(json.dumps(told).encode())
         for name, weights in sorted(self.network.state_dict().items()):
             digest.update(name.encode())

@@ -207,6 +207,9 @@ def test_a_tag_brings_its_activation_and_its_preprocessing(
         other = clip_of(quick_gelu=not quick).eval().encode_image(4 * (rgb[:, 0] - 0.5), normalize=True)
     torch.testing.assert_close(towers.images(rgb)[:, 0], wanted, atol=1e-6, rtol=0)
     assert not torch.allclose(wanted, other, atol=1e-5)
+    by_name = Semantics(SemanticsConfig(clip_model=registered, clip_pretrained=str(tmp_path / "tag.pt")))
+    by_name._image_tower[0].mean, by_name._image_tower[0].std = towers._image_tower[0].mean, towers._image_tower[0].std
+    assert (by_name.stored_as == towers.stored_as) == (not quick), "stored vectors of another activation are not taken"
 
 
 def test_a_tag_that_is_neither_cached_nor_reachable_is_told_with_what_else_is_accepted(
@@ -214,7 +217,7 @@ def test_a_tag_that_is_neither_cached_nor_reachable_is_told_with_what_else_is_ac
 ) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(ValueError, match=r"clip_pretrained='openai' of 'RN50'.*local weights file.*cached.*'tiny'"):
+    with pytest.raises(ValueError, match=r"(?s)clip_pretrained='openai' of 'RN50'.*local weights file.*cached.*'tiny'"):
         semantics.create_clip("RN50", "openai")
 
 
