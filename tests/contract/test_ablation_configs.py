@@ -5,18 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import open_clip
 import pytest
 import torch
 import yaml
 from test_configs import load
 from test_policy_acting import LONG, act, whole_window
 from tiny_policy import CAMERAS, STILL, episode, policy_features, stack, tiny_policy, window
+from tiny_weights import clip_file
 
 from dataset_tools import config_files
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.geometry import canonical
-from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import NetworkConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
@@ -46,10 +45,7 @@ def shrunk(network: NetworkConfig, clip: Path) -> NetworkConfig:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(3)
-    path = tmp_path_factory.mktemp("clip") / "tiny.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), path)
-    return path
+    return clip_file(tmp_path_factory.mktemp("clip") / "tiny.pt")
 
 
 @pytest.fixture(params=[*ABLATIONS, *PRESETS])

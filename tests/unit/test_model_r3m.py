@@ -1,13 +1,11 @@
 """R3M's ResNet: its published checkpoint gives torchvision's network, frozen; a file is data, never code."""
 
-import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-import torchvision
+from tiny_weights import code_file, r3m_checkpoint, resnet
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,28 +17,10 @@ CPU = torch.device("cpu")
 MEAN, STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
 
 
-def published(convnet: nn.Module) -> dict[str, Any]:
-    """The layout of R3M's snapshots: names of data-parallel training, a language model beside the ResNet."""
-    weights = {f"module.convnet.{name}": values for name, values in convnet.state_dict().items()}
-    language = {"module.lang_enc.model.embeddings.weight": torch.ones(3), "module.lang_rew.pred.0.bias": torch.ones(2)}
-    return {"r3m": weights | language, "global_step": 7}
-
-
-def resnet(depth: int) -> nn.Module:
-    """torchvision's network without its classifier; statistics that only training makes."""
-    torch.manual_seed(depth)
-    network: nn.Module = getattr(torchvision.models, f"resnet{depth}")(weights=None)
-    network.fc = nn.Identity()
-    for name, statistic in network.named_buffers():
-        if name.endswith("running_mean"):
-            statistic.normal_(std=0.1)
-    return network.eval()
-
-
 @pytest.fixture(scope="module")
 def smallest(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, nn.Module]:
     path, network = tmp_path_factory.mktemp("r3m") / "model.pt", resnet(18)
-    torch.save(published(network), path)
+    torch.save(r3m_checkpoint(network), path)
     return path, network
 
 
@@ -61,7 +41,7 @@ def test_vectors_are_those_of_the_published_network(smallest: tuple[Path, nn.Mod
 
 @pytest.mark.parametrize(("depth", "width"), [(34, 512), (50, 2048)])
 def test_depth_is_read_from_the_file(depth: int, width: int, tmp_path: Path) -> None:
-    torch.save(published(resnet(depth)), tmp_path / "model.pt")
+    torch.save(r3m_checkpoint(resnet(depth)), tmp_path / "model.pt")
     assert R3mTower(str(tmp_path / "model.pt")).width == width
 
 
@@ -78,7 +58,7 @@ def test_it_takes_the_place_of_clip_s_image_tower_alone(smallest: tuple[Path, nn
 
 def test_fingerprint_tells_weights_apart_and_only_them(smallest: tuple[Path, nn.Module], tmp_path: Path) -> None:
     path, network = smallest
-    weights = published(network)
+    weights = r3m_checkpoint(network)
     torch.save({"r3m": weights["r3m"]}, tmp_path / "same.pt")
     weights["r3m"]["module.convnet.conv1.weight"] = weights["r3m"]["module.convnet.conv1.weight"] + 1
     torch.save(weights, tmp_path / "other.pt")
@@ -90,14 +70,9 @@ def test_fingerprint_tells_weights_apart_and_only_them(smallest: tuple[Path, nn.
     assert first == same != other
 
 
-class Command:
-    """Unpickling this would create a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        return Path.touch, (self.path,)
+def cut_off(path: Path) -> None:
+    torch.save(r3m_checkpoint(resnet(18)), path)
+    path.write_bytes(path.read_bytes()[:9999])
 
 
 def broken_files() -> dict[str, Callable[[Path], object]]:
@@ -106,8 +81,11 @@ def broken_files() -> dict[str, Callable[[Path], object]]:
         "empty": lambda path: path.touch(),
         "another layout": lambda path: torch.save({"state_dict": {}}, path),
         "a list": lambda path: torch.save([1, 2], path),
-        "cut off": lambda path: (torch.save(published(resnet(18)), path), path.write_bytes(path.read_bytes()[:9999])),
-        "code": lambda path: path.write_bytes(pickle.dumps({"r3m": Command(path.with_name("executed"))})),
+        "cut off": lambda path: (
+            torch.save(r3m_checkpoint(resnet(18)), path),
+            path.write_bytes(path.read_bytes()[:9999]),
+        ),
+        "code": lambda path: code_file(path, "r3m", path.with_name("executed")),
     }
 
 
@@ -121,7 +99,7 @@ def test_files_that_are_no_checkpoint_are_refused_by_name_and_execute_nothing(ki
 
 
 def test_weights_of_another_network_are_refused(smallest: tuple[Path, nn.Module], tmp_path: Path) -> None:
-    weights = published(resnet(18))
+    weights = r3m_checkpoint(resnet(18))
     missing = {"r3m": {name: w for name, w in weights["r3m"].items() if "layer2.1" not in name}}
     transformer = {"r3m": {"module.convnet.encoder.layer.0.weight": torch.ones(2)}}
     for content, message in ((missing, "is not R3M's resnet18"), (transformer, "holds none of R3M's networks")):

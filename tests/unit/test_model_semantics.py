@@ -1,15 +1,14 @@
 """CLIP towers: trained or frozen, one vector per distinct image and sentence, weights from a local file or a tag."""
 
 import json
-import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import open_clip
 import pytest
 import torch
 from safetensors.torch import save_file
+from tiny_weights import clip_file, clip_of, code_file
 
 from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import SemanticsConfig
@@ -27,11 +26,7 @@ def trained() -> Semantics:
 
 @pytest.fixture(scope="module")
 def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of the tiny architecture as open_clip writes them: the state dictionary."""
-    torch.manual_seed(5)
-    path = tmp_path_factory.mktemp("clip") / "tiny.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), path)
-    return path
+    return clip_file(tmp_path_factory.mktemp("clip") / "tiny.pt")
 
 
 def frozen(weights_file: Path) -> Semantics:
@@ -158,19 +153,14 @@ def registered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     del open_clip.factory._MODEL_CONFIGS[MODEL]
 
 
-def clip_of(**changes: Any) -> open_clip.CLIP:
-    torch.manual_seed(5)
-    return open_clip.CLIP(**semantics.TINY, **changes)
-
-
 def trained_by_open_clip(path: Path) -> None:
     """What open_clip's own training writes, on several processes."""
     weights = {f"module.{name}": values for name, values in clip_of().state_dict().items()}
     torch.save({"epoch": 3, "name": "run", "state_dict": weights, "optimizer": {"state": {}, "param_groups": []}}, path)
 
 
-FORMATS: dict[str, Callable[[Path], None]] = {
-    "weights.pt": lambda path: torch.save(clip_of().state_dict(), path),
+FORMATS: dict[str, Callable[[Path], object]] = {
+    "weights.pt": clip_file,
     "epoch_3.pt": trained_by_open_clip,
     "open_clip_model.safetensors": lambda path: save_file(clip_of().state_dict(), path),
 }
@@ -221,16 +211,6 @@ def test_a_tag_that_is_neither_cached_nor_reachable_is_told_with_what_else_is_ac
         semantics.create_clip("RN50", "openai")
 
 
-class Command:
-    """Unpickling this would create a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        return Path.touch, (self.path,)
-
-
 @pytest.mark.parametrize("kind", ["code", "empty", "other weights"])
 @pytest.mark.parametrize("model", ["tiny", MODEL])
 def test_files_that_are_no_weights_of_the_model_are_refused_and_execute_nothing(
@@ -239,7 +219,7 @@ def test_files_that_are_no_weights_of_the_model_are_refused_and_execute_nothing(
     path, executed = tmp_path / "clip.pt", tmp_path / "executed"
     path.touch()
     if kind == "code":
-        path.write_bytes(pickle.dumps({"state_dict": Command(executed)}))
+        code_file(path, "state_dict", executed)
     if kind == "other weights":
         torch.save({"visual.proj": torch.ones(2, 3)}, path)
     with pytest.raises(ValueError, match=r"cannot load semantics\.clip_pretrained='.*clip\.pt'"):
