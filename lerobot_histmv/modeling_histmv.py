@@ -19,7 +19,7 @@ from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
-from lerobot_histmv.model.view_attention import best_shares, choice_loss, ranking_loss
+from lerobot_histmv.model.view_attention import ViewAttention, best_shares, choice_loss, ranking_loss
 from lerobot_histmv.model_card import model_card
 from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
 
@@ -128,8 +128,9 @@ class HistMVPolicy(PreTrainedPolicy):
         nothing = torch.zeros_like(seen.heat[:, 0])
         share = {name: shares.detach() if name == "heatmap" else shares for name in terms}
         terms = {name: nothing.index_add(0, step, share[name] * term) for name, term in terms.items()}
-        if options.fusion == "attention":
-            terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
+        attention = self.net.view_attention
+        if isinstance(attention, ViewAttention):
+            terms["mutual_information"] = attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
             terms["choice"] = self._choice_loss(encoding, seen.text, view, acted)
         if self.training and self.net.semantics.text_is_trained and self._meanings:

@@ -55,4 +55,4 @@ class TouchWhenUnpickled:
 
 def code_file(path: Path, entry: str, executed: Path) -> None:
     """A checkpoint whose ``entry`` creates the file ``executed`` if anything unpickles it."""
-    path.write_bytes(pickle.dumps({entry: TouchWhenUnpickled(executed)}))
+    path.write_bytes(pickle.dumps({entry: TouchWhenUnpickled(executed)}, protocol=2))

@@ -107,7 +107,7 @@ class RgbaFeatures(nn.Module):
         self.use_xyz = config.use_xyz
         self.backbone = self._make_backbone(config)
         language = config.language and config.encoder != "none"
-        channels: list[int] = list(self.backbone.channels)
+        channels = list(self.backbone.channels)
         self.listen = nn.ModuleList(Modulation(count, text_width) for count in (channels if language else []))
         if config.encoder == "panet":
             self.neck: nn.Module = PANet(channels[1:], config.neck)
@@ -122,7 +122,7 @@ class RgbaFeatures(nn.Module):
         self.refine = ConvBlock(width // 2 + channels[3], width)
 
     @staticmethod
-    def _make_backbone(config: TextureConfig) -> nn.Module:
+    def _make_backbone(config: TextureConfig) -> PlainBackbone | TimmBackbone | NoTexture:
         channels_in = 6 if config.use_xyz else 3
         if config.encoder == "none":
             return NoTexture()

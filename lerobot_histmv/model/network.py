@@ -98,8 +98,9 @@ class HistMVNet(nn.Module):
         if config.points.enabled:
             self.points = PointEncoder(config.points, self.workspace, config.width)
             self.transfuse = TransFuse(config.width, config.history.heads)
-        attends = config.views.fusion == "attention"
-        self.view_attention = ViewAttention(config.views, config.width, text_width) if attends else EvenViews()
+        self.view_attention: ViewAttention | EvenViews = EvenViews()
+        if config.views.fusion == "attention":
+            self.view_attention = ViewAttention(config.views, config.width, text_width)
         self.fuse = stack_views if config.views.fusion == "tokens" else fuse_views
         self.history = History(config.history, config.width, text_width, grid)
         self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder)

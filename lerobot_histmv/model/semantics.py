@@ -161,8 +161,7 @@ class Semantics(nn.Module):
         towers = ClipTowers(config) if "clip" in (config.image, config.text) else None
         image, text = image_tower(config, towers), towers if config.text == "clip" else MiniLmText()
         assert text is not None
-        trained = towers is not None and towers.trained
-        self.trained_towers = nn.ModuleDict({"clip": towers} if trained else {})
+        self.trained_towers = nn.ModuleDict({"clip": towers} if towers is not None and towers.trained else {})
         self._image_tower, self._text_tower = [image], [text]
         self._cache: dict[str, Tensor] = {}
         self.image_width, self.text_width = image.width if image else 0, text.width
