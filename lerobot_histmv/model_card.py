@@ -61,7 +61,7 @@ def _opening(config: HistMVConfig) -> str:
     return (
         f"A history-sensitive multi-view keyframe policy (`histmv` {lerobot_histmv.__version__}): from colour, depth "
         f"and calibration of the cameras {', '.join(config.cameras)} ({columns} x {rows} pixels), an instruction and "
-        f"{config.network.history.past_steps} past steps to the next key pose of the tool."
+        f"{config.network.history.memory} past steps to the next key pose of the tool."
     )
 
 

@@ -16,9 +16,10 @@ from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data.instructions import load_paraphrases, meanings
 from lerobot_histmv.model import augment, losses
+from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
-from lerobot_histmv.model.view_attention import best_shares, choice_loss, ranking_loss
+from lerobot_histmv.model.view_attention import ViewAttention, best_shares, choice_loss, ranking_loss
 from lerobot_histmv.model_card import model_card
 from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
 
@@ -34,7 +35,8 @@ class Decision:
     Args:
         weights: view weights.
         view: index of the chosen view.
-        heat: heat map over the chosen view's pixels, sums to 1.
+        heat: heat map over the chosen view's pixels, sums to 1; to the view's share with decode="all", where the view
+            chosen is the one with most of the heat.
         surface: expectation of the heat map over the cloud, before the offset [m].
     """
 
@@ -92,8 +94,8 @@ class HistMVPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget all past steps; call it whenever the environments are reset."""
-        steps = self.config.network.history.past_steps + 1
-        self._fused: deque[Float[Tensor, "b d h w"]] = deque(maxlen=steps)
+        steps = self.config.network.history.memory + 1
+        self._fused: deque[Float[Tensor, "b d kh w"]] = deque(maxlen=steps)
         self._tools: deque[Float[Tensor, "b 3"]] = deque(maxlen=steps)
         self.last_decision: Decision | None = None
 
@@ -112,12 +114,13 @@ class HistMVPolicy(PreTrainedPolicy):
             if self.training:
                 window = self._augment(window)
             seen = window.observe(text)
-        choice = config.network.views.train_choice if self.training else "best"
+        options = config.network.views
+        choice = options.train_choice if self.training and options.decode == "one" else "best"
         encoding, predicted, views, shares = self.net(seen, window.real, choice)
 
         step, view = views.unbind(-1)
         target = window.target
-        terms = losses.action_losses(predicted, target[step], encoding.cloud[step, view], config.loss)
+        terms = losses.action_losses(predicted, target[step], self.net.heat_cloud(encoding, views), config.loss)
         # Views are judged by their actions alone: one that shows nothing near the target has no heat map loss at all.
         acted = losses.weighted_sum({name: term for name, term in terms.items() if name != "heatmap"}, config.loss)
         if choice == "ranked":
@@ -125,7 +128,9 @@ class HistMVPolicy(PreTrainedPolicy):
         nothing = torch.zeros_like(seen.heat[:, 0])
         share = {name: shares.detach() if name == "heatmap" else shares for name in terms}
         terms = {name: nothing.index_add(0, step, share[name] * term) for name, term in terms.items()}
-        terms["mutual_information"] = self.net.view_attention.redundancy(encoding.maps, encoding.weights)
+        attention = self.net.view_attention
+        if isinstance(attention, ViewAttention):
+            terms["mutual_information"] = attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
             terms["choice"] = self._choice_loss(encoding, seen.text, view, acted)
         if self.training and self.net.semantics.text_is_trained and self._meanings:
@@ -161,7 +166,7 @@ class HistMVPolicy(PreTrainedPolicy):
         fused = rearrange(torch.stack(list(self._fused), dim=1), "b t d h w -> (b t) d h w")
         enriched = self.net.remember(fused, text.repeat_interleave(len(self._fused), dim=0), real)
         predicted, views = self.net.decode_best(encoding, enriched[len(self._fused) - 1 :: len(self._fused)])
-        self.last_decision = Decision(encoding.weights, views[:, 1], predicted.log_heat.exp(), predicted.surface)
+        self.last_decision = self._decision(encoding, predicted, views[:, 1])
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)
 
     def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Float[Tensor, "b 1 8"]:
@@ -178,6 +183,13 @@ class HistMVPolicy(PreTrainedPolicy):
         if not action.isfinite().all():
             raise ValueError(f"the policy's action is not finite: {action.tolist()}; check the observation for NaN")
         return action
+
+    @staticmethod
+    def _decision(encoding: Encoding, predicted: Prediction, view: Int[Tensor, " b"]) -> Decision:
+        rows = torch.arange(len(view), device=view.device)
+        heat = rearrange(predicted.log_heat.exp(), "b (k y) x -> b k y x", y=encoding.cloud.shape[-2])
+        own = heat[rows, view.clamp_max(heat.shape[1] - 1)]  # one view's heat map stands alone, whichever it is
+        return Decision(encoding.weights, view, own, predicted.surface)
 
     def _choice_loss(
         self, encoding: Encoding, text: Float[Tensor, "n c"], view: Int[Tensor, " m"], losses: Float[Tensor, " m"]

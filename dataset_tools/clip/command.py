@@ -1,4 +1,4 @@
-"""``histmv cache-clip``: a dataset again, with the frozen CLIP vector of every colour image as further columns."""
+"""``histmv cache-clip``: a dataset again, with a frozen tower's vector of every colour image as further columns."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -18,7 +18,8 @@ from dataset_tools.source import Source, open_dataset
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
 from lerobot_histmv.model.config import SemanticsConfig
-from lerobot_histmv.model.semantics import ClipTowers
+from lerobot_histmv.model.image_tower import ImageTower
+from lerobot_histmv.model.semantics import image_tower
 
 BATCH = 32
 """Images per call of the tower."""
@@ -26,17 +27,21 @@ BATCH = 32
 
 @dataclass
 class CacheClipConfig:
-    """Write a keyframed dataset again, with the vector that a frozen CLIP gives of every colour image.
+    """Write a keyframed dataset again, with the vector that a frozen CLIP (or R3M) gives of every colour image.
 
         histmv cache-clip --dataset.repo_id=me/keys --output.repo_id=me/keys_clip --clip_model=ViT-B-32
 
-    Training with the same --policy.network.semantics.clip_model and clip_pretrained then never runs CLIP. The columns'
+    Training with the same --policy.network.semantics.* then never runs the tower on images. The columns'
     names hold a fingerprint of weights and preprocessing: a policy with others does not take them and runs its own. The
     vectors are those of the images as recorded; augmentation does not reach them.
     """
 
     dataset: WholeDataset
     output: OutputPlace
+    # Which tower encodes, as in --policy.network.semantics.image: clip or r3m.
+    image: str = "clip"
+    # Checkpoint file of image=r3m.
+    r3m_pretrained: str | None = None
     # Model by open_clip's name, or tiny.
     clip_model: str = "ViT-B-32"
     # open_clip's tag, or a local weights file.
@@ -51,18 +56,27 @@ def run(config: CacheClipConfig) -> None:
     """Encode every image, then write the dataset; it appears whole or not at all.
 
     Raises:
-        ValueError: see ``source``, ``frames`` and ``semantics.create_clip``; or the dataset has these vectors already.
+        ValueError: see ``source``, ``frames``, ``semantics.create_clip`` and ``r3m``; or the dataset has these vectors
+            already.
     """
     console = Console(highlight=False)
     root = config.output.folder()
-    told = config.dataset
-    source = open_dataset(told.repo_id, told.root, None, told.revision)
+    given = config.dataset
+    source = open_dataset(given.repo_id, given.root, None, given.revision)
     if root == source.root.resolve():
         raise ValueError(f"--output.root is the dataset itself ({root}); give another folder")
-    clip = SemanticsConfig(clip_model=config.clip_model, clip_pretrained=config.clip_pretrained)
-    place = Workplace(root, {"source": str(source.root), **asdict(clip)}, config.overwrite, "encoded")
+    told = SemanticsConfig(
+        image=config.image,
+        r3m_pretrained=config.r3m_pretrained,
+        clip_model=config.clip_model,
+        clip_pretrained=config.clip_pretrained,
+    )
+    place = Workplace(root, {"source": str(source.root), **asdict(told)}, config.overwrite, "encoded")
     place.check_free()
-    towers = ClipTowers(clip).to(config.device).eval()
+    towers = image_tower(told)
+    if towers is None:
+        raise ValueError(f"--image={config.image} encodes nothing; choose clip or r3m")
+    towers = towers.to(config.device).eval()
     wanted = {keys.clip_key(towers.fingerprint(), camera): keys.rgb_key(camera) for camera in cameras_of(source)}
     if not wanted:
         raise ValueError(f"{source.root} has no colour images; its features are {', '.join(source.features)}")
@@ -85,7 +99,7 @@ def run(config: CacheClipConfig) -> None:
 
 
 def vectors(
-    source: Source, episode: int, wanted: dict[str, str], towers: ClipTowers, device: str
+    source: Source, episode: int, wanted: dict[str, str], towers: ImageTower, device: str
 ) -> Iterator[tuple[str, Float32[np.ndarray, "n c"]]]:
     """Vectors of every camera's images in an episode, by the key that they get."""
     frames = range(source.length(episode))
@@ -96,7 +110,7 @@ def vectors(
 
 
 @torch.no_grad()
-def encoded(pixels: UInt8[np.ndarray, "n y x 3"], towers: ClipTowers, device: str) -> Float32[np.ndarray, "n c"]:
+def encoded(pixels: UInt8[np.ndarray, "n y x 3"], towers: ImageTower, device: str) -> Float32[np.ndarray, "n c"]:
     """Vectors of colour images, as the policy computes them of LeRobot's tensors."""
     parts = []
     for batch in torch.from_numpy(pixels).split(BATCH):

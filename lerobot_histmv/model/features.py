@@ -81,12 +81,23 @@ class PANet(nn.Module):
         return maps
 
 
+class NoTexture(nn.Module):
+    """Stands where a backbone is, without one: of texture and pose the levels have the pose alone."""
+
+    channels = (1, 1, 1, 1)
+
+    def forward(self, poses: Float[Tensor, "n 1 y8 x8"]) -> list[Float[Tensor, "n 1 _ _"]]:
+        """The poses' map at strides 2, 4, 8 and 16."""
+        coarse = functional.avg_pool2d(poses, 2)
+        return [*(functional.interpolate(poses, scale_factor=times, mode="nearest") for times in (4, 2)), poses, coarse]
+
+
 class RgbaFeatures(nn.Module):
     """Texture pyramid and RGB-A feature map FR of every view.
 
     Args:
         config: texture part of the network's configuration.
-        semantic_width: length of the global semantic vector.
+        semantic_width: length of the global semantic vector; 0 for none.
         text_width: length of the instruction vector.
         width: d, channels of FR.
     """
@@ -94,19 +105,30 @@ class RgbaFeatures(nn.Module):
     def __init__(self, config: TextureConfig, semantic_width: int, text_width: int, width: int) -> None:
         super().__init__()
         self.use_xyz = config.use_xyz
-        channels_in = 6 if config.use_xyz else 3
-        if config.backbone == "plain":
-            self.backbone: nn.Module = PlainBackbone(channels_in, config.widths)
+        self.backbone = self._make_backbone(config)
+        language = config.language and config.encoder != "none"
+        channels = list(self.backbone.channels)
+        self.listen = nn.ModuleList(Modulation(count, text_width) for count in (channels if language else []))
+        if config.encoder == "panet":
+            self.neck: nn.Module = PANet(channels[1:], config.neck)
+            channels = [channels[0], *[config.neck] * 3]
         else:
-            self.backbone = TimmBackbone(config.backbone, channels_in, config.pretrained)
-        self.listen = nn.ModuleList(
-            Modulation(channels, text_width) for channels in (self.backbone.channels if config.language else [])
-        )
-        self.neck = PANet(self.backbone.channels[1:], config.neck)
-        self.skip_channels = [self.backbone.channels[0], *[config.neck] * 3]
-        self.semantic = nn.Linear(semantic_width, config.neck)
-        self.fuse = ConvBlock(2 * config.neck + 1, width // 2)
-        self.refine = ConvBlock(width // 2 + config.neck, width)
+            self.neck = nn.Identity()
+        self.skip_channels = channels
+        # Without a semantic vector an empty one is joined.
+        expanded = config.neck if semantic_width else 0
+        self.semantic = nn.Linear(semantic_width, expanded) if semantic_width else nn.Identity()
+        self.fuse = ConvBlock(channels[2] + 1 + expanded, width // 2)
+        self.refine = ConvBlock(width // 2 + channels[3], width)
+
+    @staticmethod
+    def _make_backbone(config: TextureConfig) -> PlainBackbone | TimmBackbone | NoTexture:
+        channels_in = 6 if config.use_xyz else 3
+        if config.encoder == "none":
+            return NoTexture()
+        if config.backbone == "plain":
+            return PlainBackbone(channels_in, config.widths)
+        return TimmBackbone(config.backbone, channels_in, config.pretrained)
 
     def forward(
         self,
@@ -126,10 +148,7 @@ class RgbaFeatures(nn.Module):
             text: instruction vector.
         """
         k = rgb.shape[1]
-        flat = rearrange(rgb, "n k c y x -> (n k) c y x") * 2 - 1
-        if self.use_xyz:
-            flat = torch.cat([flat, rearrange(xyz, "n k c y x -> (n k) c y x")], dim=1)
-        first, *rest = self._listened(self.backbone(flat.contiguous(memory_format=torch.channels_last)), text)
+        first, *rest = self._listened(self._texture(rgb, xyz, poses), text)
         levels = self.neck(rest)
         texture, coarse = levels[1], levels[2]
         expanded = self.semantic(rearrange(semantics, "n k c -> (n k) c"))
@@ -138,6 +157,17 @@ class RgbaFeatures(nn.Module):
         pooled = functional.avg_pool2d(self.fuse(joined), 2)
         features = self.refine(torch.cat([pooled, coarse], dim=1))
         return rearrange(features, "(n k) c y x -> n k c y x", k=k), [first, *levels]
+
+    def _texture(
+        self, rgb: Float[Tensor, "n k 3 y x"], xyz: Float[Tensor, "n k 3 y x"], poses: Float[Tensor, "n k 1 y8 x8"]
+    ) -> list[Float[Tensor, "nk _ _ _"]]:
+        """The backbone's levels at strides 2, 4, 8 and 16."""
+        if isinstance(self.backbone, NoTexture):
+            return self.backbone(rearrange(poses, "n k c y x -> (n k) c y x"))
+        flat = rearrange(rgb, "n k c y x -> (n k) c y x") * 2 - 1
+        if self.use_xyz:
+            flat = torch.cat([flat, rearrange(xyz, "n k c y x -> (n k) c y x")], dim=1)
+        return self.backbone(flat.contiguous(memory_format=torch.channels_last))
 
     def _listened(
         self, levels: list[Float[Tensor, "nk _ _ _"]], text: Float[Tensor, "n e"]

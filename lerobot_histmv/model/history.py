@@ -57,7 +57,8 @@ class History(nn.Module):
         config: history part of the network's configuration.
         width: d.
         text_width: length of the instruction vector.
-        grid: rows and columns of a step's feature map.
+        grid: rows and columns of a view's feature map. A step's map has these, or a multiple of the rows when it holds
+            several views, one below the other.
     """
 
     def __init__(self, config: HistoryConfig, width: int, text_width: int, grid: tuple[int, int]) -> None:
@@ -65,7 +66,7 @@ class History(nn.Module):
         self.skip_first = config.skip_first
         self.patch_in, self.patch_out = nn.Conv2d(width, width, 1), nn.Conv2d(width, width, 1)
         self.modulation = Modulation(width, text_width)
-        self.step_code = nn.Embedding(config.past_steps + 1, width)
+        self.step_code = nn.Embedding(config.memory + 1, width)
         self.patch_code = nn.Parameter(torch.randn(width, *grid) * 0.02)
         nn.init.normal_(self.step_code.weight, std=0.02)
         self.layers = nn.ModuleList(
@@ -99,4 +100,6 @@ class History(nn.Module):
         b, t = fused.shape[:2]
         patches = self.patch_in(rearrange(fused, "b t d h w -> (b t) d h w"))
         spoken = functional.gelu(self.modulation(patches, repeat(text, "b c -> (b t) c", t=t)))
-        return fused + rearrange(self.patch_out(spoken), "(b t) d h w -> b t d h w", b=b) + self.patch_code
+        views = fused.shape[-2] // self.patch_code.shape[-2]
+        codes = repeat(self.patch_code, "d h w -> d (k h) w", k=views)
+        return fused + rearrange(self.patch_out(spoken), "(b t) d h w -> b t d h w", b=b) + codes

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from einops import reduce
+from einops import rearrange, reduce
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
@@ -16,7 +16,14 @@ from lerobot_histmv.model.history import History
 from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.points import PointEncoder
 from lerobot_histmv.model.semantics import Semantics
-from lerobot_histmv.model.view_attention import ViewAttention, choose_views, fuse_views, most_informative
+from lerobot_histmv.model.view_attention import (
+    EvenViews,
+    ViewAttention,
+    choose_views,
+    fuse_views,
+    most_informative,
+    stack_views,
+)
 
 
 @dataclass
@@ -49,17 +56,17 @@ class Encoding:
     """Features of ``n`` steps; ``fused`` is all that later steps need of earlier ones.
 
     Args:
-        fused: FT, the views' weighted sum.
+        fused: FT, the views' weighted sum; with fusion="tokens" the maps of all views, one below the other.
         maps: F of every view.
         features: FR of every view.
         skips: PANet levels of all n * k images, fine to coarse.
         cloud: world coordinates of every pixel [m].
         valid: pixels with a measurement inside the workspace.
-        weights: view weights w.
+        weights: view weights w; equal ones where view attention is off.
         eyes: position of every camera [m].
     """
 
-    fused: Float[Tensor, "n d h w"]
+    fused: Float[Tensor, "n d kh w"]
     maps: Float[Tensor, "n k d h w"]
     features: Float[Tensor, "n k d h w"]
     skips: list[Float[Tensor, "nk _ _ _"]]
@@ -88,11 +95,16 @@ class HistMVNet(nn.Module):
         self.semantics = Semantics(config.semantics)
         text_width = self.semantics.text_width
         self.rgba = RgbaFeatures(config.texture, self.semantics.image_width, text_width, config.width)
-        self.points = PointEncoder(config.points, self.workspace, config.width)
-        self.transfuse = TransFuse(config.width, config.history.heads)
-        self.view_attention = ViewAttention(config.views, config.width, text_width)
+        if config.points.enabled:
+            self.points = PointEncoder(config.points, self.workspace, config.width)
+            self.transfuse = TransFuse(config.width, config.history.heads)
+        self.view_attention: ViewAttention | EvenViews = EvenViews()
+        if config.views.fusion == "attention":
+            self.view_attention = ViewAttention(config.views, config.width, text_width)
+        self.fuse = stack_views if config.views.fusion == "tokens" else fuse_views
         self.history = History(config.history, config.width, text_width, grid)
-        self.decoder = Decoder(config.width, self.rgba.skip_channels)
+        self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder)
+        self.config = config
 
     def forward(
         self, seen: Observation, real: Bool[Tensor, "b t"], choice: str
@@ -116,21 +128,26 @@ class HistMVNet(nn.Module):
             cloud = deproject(seen.depth, seen.intrinsics, seen.extrinsics)
             scaled, valid = self.workspace.normalise_map(cloud, seen.depth)
             pixels, depths = project(seen.tool, seen.intrinsics, seen.extrinsics)
-            poses = pose_heat_map(pixels, depths, seen.heat, cells, POSE_STRIDE)
+            # Only the current position has the full heat of 1: without memory the others go out.
+            heat = seen.heat if self.config.history.memory else seen.heat.floor()
+            poses = pose_heat_map(pixels, depths, heat, cells, POSE_STRIDE)
 
         meanings = self.semantics.images(seen.rgb) if seen.clip is None else seen.clip
         features, skips = self.rgba(seen.rgb, scaled, poses, meanings, seen.text)
-        points = self.points(cloud, seen.rgb, valid)
-        maps = self.transfuse(features, self._cell_means(scaled, valid), points)
+        maps = features
+        if self.config.points.enabled:
+            points = self.points(cloud, seen.rgb, valid)
+            maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
-        return Encoding(
-            fuse_views(maps, weights), maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3]
-        )
+        fused = self.fuse(maps, weights)
+        return Encoding(fused, maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3])
 
     def remember(
-        self, fused: Float[Tensor, "n d h w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
-    ) -> Float[Tensor, "n d h w"]:
+        self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
+    ) -> Float[Tensor, "n d kh w"]:
         """History-enriched maps of the n real steps of b windows; ``n = real.sum()``, in row-major order."""
+        if not self.config.history.memory:  # every step is a window of its own
+            real = real.new_ones(len(fused), 1)
         window = fused.new_zeros(*real.shape, *fused.shape[1:])
         window[real] = fused
         last = real.sum(dim=1).cumsum(dim=0) - 1
@@ -152,18 +169,45 @@ class HistMVNet(nn.Module):
         )
 
     def decode_best(
-        self, encoding: Encoding, enriched: Float[Tensor, "n d h w"]
+        self, encoding: Encoding, enriched: Float[Tensor, "n d kh w"]
     ) -> tuple[Prediction, Int[Tensor, "n 2"]]:
-        """Decode every view and keep, of each step, the one with the largest product of weight and certainty.
+        """Decode each step as when acting: from its best view, or from all together; and the (step, view) pairs.
 
-        The weights know how good a view usually is; that the arm hides the target in it shows in a torn heat map.
+        The best view is that of the largest weight, or of the largest product of weight and certainty, for which all
+        are decoded: the weights know how good a view usually is; that the arm hides the target in it shows in a torn
+        heat map.
         """
+        if self.config.views.decode == "all":
+            return self._decode_together(encoding, enriched)
+        if self.config.views.act == "weight":
+            views = choose_views(encoding.weights, "argmax")[0]
+            return self.decode(encoding, enriched, views), views
         views = choose_views(encoding.weights, "expected")[0]
         predicted = self.decode(encoding, enriched, views)
         n, k = encoding.weights.shape
         best = most_informative(encoding.weights * predicted.certainty.view(n, k))
         rows = torch.arange(n, device=best.device) * k + best
         return predicted.at(rows), views[rows]
+
+    def _decode_together(
+        self, encoding: Encoding, enriched: Float[Tensor, "n d kh w"]
+    ) -> tuple[Prediction, Int[Tensor, "n 2"]]:
+        """Decode all views of each step with one softmax; the view named is the one with most of the heat."""
+        h = encoding.features.shape[-2]
+        own = rearrange(enriched, "n d (k h) w -> n k d h w", h=h)  # k is 1 for a map that all views share
+        maps = own.expand_as(encoding.features)
+        predicted, shares = self.decoder.together(
+            maps, encoding.features, encoding.skips, encoding.cloud, encoding.valid, encoding.eyes
+        )
+        steps = torch.arange(len(shares), device=shares.device)
+        return predicted, torch.stack([steps, most_informative(shares)], dim=-1)
+
+    def heat_cloud(self, encoding: Encoding, views: Int[Tensor, "m 2"]) -> Float[Tensor, "m 3 y x"]:
+        """World points [m] under the heat maps of decoded pairs: of the pair's view, or of all views of its step."""
+        step, view = views.unbind(-1)
+        if self.config.views.decode == "all":
+            return rearrange(encoding.cloud, "n k c y x -> n c (k y) x")
+        return encoding.cloud[step, view]
 
     @staticmethod
     def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:

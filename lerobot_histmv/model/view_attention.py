@@ -110,6 +110,22 @@ class ViewAttention(nn.Module):
             return mutual_information_loss(weights.float(), matrix, self.form)
 
 
+class EvenViews(nn.Module):
+    """Equal weights of the views that show something: view attention switched off."""
+
+    def forward(
+        self, maps: Float[Tensor, "n k d h w"], text: Float[Tensor, "n c"], present: Bool[Tensor, "n k"]
+    ) -> Float[Tensor, "n k"]:
+        """1 over the number of ``present`` views for each of them, 0 for the others; unless no view is present."""
+        usable = present | ~present.any(dim=-1, keepdim=True)
+        return even_shares(usable.to(maps.dtype))
+
+
+def stack_views(maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, "n d kh w"]:
+    """The maps of all views, one below the other; those of views without weight become 0."""
+    return rearrange(maps * (weights > 0)[:, :, None, None, None], "n k d h w -> n d (k h) w")
+
+
 def fuse_views(maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, "n d h w"]:
     """FT = sum_k w_k F_k (Eq. 7)."""
     return einsum(maps, weights, "n k d h w, n k -> n d h w")

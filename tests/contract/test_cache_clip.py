@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import open_clip
 import pytest
 import test_policy_dataset as sample
 import torch
@@ -12,22 +11,21 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from tiny_policy import CAMERAS, STILL
 from tiny_scene import tiny_network
+from tiny_weights import clip_file, r3m_checkpoint, resnet
 
 from dataset_tools import cli
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import SemanticsConfig
+from lerobot_histmv.model.r3m import R3mTower
 from lerobot_histmv.model.semantics import ClipTowers
 
 root = sample.root
 
 
 def weights(folder: Path, seed: int) -> Path:
-    torch.manual_seed(seed)
-    path = folder / f"tiny_{seed}.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), path)
-    return path
+    return clip_file(folder / f"tiny_{seed}.pt", seed)
 
 
 def cache(source: Path, output: Path, file: Path, *more: str) -> Path:
@@ -47,13 +45,17 @@ def cached(root: Path, file: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return cache(root, tmp_path_factory.mktemp("cached") / "data", file)
 
 
+def frozen(file: Path) -> SemanticsConfig:
+    return SemanticsConfig(clip_pretrained=str(file))
+
+
 def towers(file: Path) -> ClipTowers:
-    return ClipTowers(SemanticsConfig(clip_pretrained=str(file)))
+    return ClipTowers(frozen(file))
 
 
-def policy_and_batch(data: Path, file: Path) -> tuple[Any, dict[str, Any]]:
-    """A policy in training with the frozen towers of ``file``, and windows of ``data`` as LeRobot gives them."""
-    network = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(file)))
+def policy_and_batch(data: Path, chosen: SemanticsConfig) -> tuple[Any, dict[str, Any]]:
+    """A policy in training with these towers, and windows of ``data`` as LeRobot gives them."""
+    network = tiny_network(semantics=chosen)
     config = HistMVConfig(device="cpu", push_to_hub=False, network=network, augment=STILL)
     meta = LeRobotDatasetMetadata("local/tiny", root=data)
     torch.manual_seed(0)
@@ -85,13 +87,13 @@ def test_columns_are_the_vectors_of_the_images_and_the_rest_is_unchanged(root: P
 def test_training_never_runs_the_image_tower_and_learns_the_same(
     root: Path, cached: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain = loss_and_gradients(*policy_and_batch(root, file))
+    plain = loss_and_gradients(*policy_and_batch(root, frozen(file)))
 
     def forbidden(*_: object) -> None:
         raise AssertionError("the image tower ran")
 
     monkeypatch.setattr(ClipTowers, "images", forbidden)
-    policy, batch = policy_and_batch(cached, file)
+    policy, batch = policy_and_batch(cached, frozen(file))
     assert not any(key.startswith(keys.CLIP_PREFIX) for key in policy.config.input_features)
     stored = loss_and_gradients(policy, batch)
     assert len(stored) == len(plain) > 1
@@ -100,12 +102,34 @@ def test_training_never_runs_the_image_tower_and_learns_the_same(
 
 
 def test_vectors_of_other_weights_are_not_taken(cached: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, batch = policy_and_batch(cached, weights(tmp_path, seed=7))
+    policy, batch = policy_and_batch(cached, frozen(weights(tmp_path, seed=7)))
     ran: list[int] = []
     real = ClipTowers.images
     monkeypatch.setattr(ClipTowers, "images", lambda self, rgb: (ran.append(len(rgb)), real(self, rgb))[1])
     loss_and_gradients(policy, batch)
     assert ran
+
+
+def test_r3m_s_vectors_are_stored_and_taken_likewise(
+    root: Path, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = tmp_path / "r3m.pt"
+    torch.save(r3m_checkpoint(resnet(18)), checkpoint)
+    chosen = SemanticsConfig(image="r3m", r3m_pretrained=str(checkpoint))
+    data = cache(root, tmp_path / "data", file, "--image=r3m", f"--r3m_pretrained={checkpoint}")
+    plain = loss_and_gradients(*policy_and_batch(root, chosen))
+    monkeypatch.setattr(R3mTower, "images", None)
+    for mine, other in zip(loss_and_gradients(*policy_and_batch(data, chosen)), plain, strict=True):
+        torch.testing.assert_close(mine, other, atol=1e-5, rtol=1e-4)
+
+
+def test_an_image_tower_that_does_not_exist_is_refused(
+    root: Path, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, message in (("none", "choose clip or r3m"), ("dino", "semantics.image='dino'")):
+        with pytest.raises(SystemExit):
+            cache(root, tmp_path / "data", file, f"--image={name}")
+        assert message in capsys.readouterr().err
 
 
 def test_trained_towers_take_none(cached: Path) -> None:

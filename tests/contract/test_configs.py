@@ -9,7 +9,7 @@ from lerobot.configs.train import TrainPipelineConfig
 import lerobot_policy_histmv  # noqa: F401
 from dataset_tools import config_files
 
-TRAIN = [name for name in config_files.names() if name.startswith("train/")]
+TRAIN = [name for name in config_files.names() if name.startswith(("train/", "ablation/"))]
 
 
 def load(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> TrainPipelineConfig:

