@@ -105,6 +105,12 @@ def explainer(config: ExplainConfig) -> Callable[[Path], Explained]:
     policy = load_config(config.policy)
     if not isinstance(policy, HistMVConfig):
         raise ValueError(f"{config.policy.path} is a policy of type {policy.type}; explain looks inside histmv ones")
+    views = policy.network.views
+    if (views.decode, views.act) != ("one", "certainty"):
+        raise ValueError(
+            f"{config.policy.path} has views.decode={views.decode!r} and views.act={views.act!r}; explain compares what "
+            "each view alone would have done, which only views.decode='one' with views.act='certainty' computes"
+        )
     if config.env is not None:
         check_fits(policy, config.env)
         return partial(explain_rollout, policy, config.env, config.seed)
