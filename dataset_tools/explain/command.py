@@ -108,8 +108,8 @@ def explainer(config: ExplainConfig) -> Callable[[Path], Explained]:
     views = policy.network.views
     if (views.decode, views.act) != ("one", "certainty"):
         raise ValueError(
-            f"{config.policy.path} has views.decode={views.decode!r} and views.act={views.act!r}; explain compares what "
-            "each view alone would have done, which only views.decode='one' with views.act='certainty' computes"
+            f"{config.policy.path} has views.decode={views.decode!r} and views.act={views.act!r}; explain compares "
+            "what each view alone would have done, which only views.decode='one' with views.act='certainty' computes"
         )
     if config.env is not None:
         check_fits(policy, config.env)
