@@ -94,8 +94,14 @@ def check_fits(policy: PreTrainedConfig, env: EnvConfig) -> None:
     Raises:
         ValueError: names what differs and the option that cures it.
     """
-    if policy.type == "histmv" and getattr(env, "control", "macro") != "macro":
-        raise ValueError(f"env.control={env.control}: an action of histmv is a whole motion; set --env.control=macro")
+    if policy.type == "histmv":
+        control, rate = getattr(env, "control", "macro"), policy.control.rate
+        wanted_rate = 0 if control == "macro" else env.fps
+        if rate != wanted_rate:
+            raise ValueError(
+                f"policy.control.rate={rate:g} does not fit env.control={control}; set --policy.control.rate="
+                f"{wanted_rate} (0: an action is a whole macro step; {env.fps}: one tick of control=servo)"
+            )
     offered = env_to_policy_features(env)
     wanted = policy.input_features or {}
     cameras, env_cameras = (list(getattr(config, "cameras", [])) for config in (policy, env))

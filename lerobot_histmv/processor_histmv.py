@@ -56,7 +56,7 @@ class CheckInputStep(ProcessorStep):
                 quaternion is not unit.
         """
         new = transition.copy()
-        observation = dict(new[TransitionKey.OBSERVATION] or {})
+        observation = separate_calibration(dict(new[TransitionKey.OBSERVATION] or {}), len(self.cameras))
         seeing = {}
         for camera in self.cameras:
             for key in (keys.rgb_key(camera), keys.depth_key(camera)):
@@ -103,6 +103,19 @@ class CheckInputStep(ProcessorStep):
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """Features stay as they are."""
         return features
+
+
+def separate_calibration(observation: dict[str, Any], cameras: int) -> dict[str, Any]:
+    """The observation with the calibration taken out of the state's end, where a ``Robot`` has to put it.
+
+    See ``keys.calibration_state_names``. An observation that has the calibration already, or too short a state, stays.
+    """
+    state = observation.get(keys.STATE)
+    rest = 0 if state is None else state.shape[-1] - 16 * cameras
+    if keys.INTRINSICS in observation or rest < len(keys.POSE_NAMES):
+        return observation
+    parts = state.split([rest, 4 * cameras, 12 * cameras], dim=-1)
+    return observation | dict(zip((keys.STATE, keys.INTRINSICS, keys.EXTRINSICS), parts, strict=True))
 
 
 def check_finite(key: str, values: Tensor) -> None:
