@@ -95,12 +95,13 @@ def check_fits(policy: PreTrainedConfig, env: EnvConfig) -> None:
         ValueError: names what differs and the option that cures it.
     """
     if policy.type == "histmv":
-        control, rate = getattr(env, "control", "macro"), policy.control.rate
-        wanted_rate = 0 if control == "macro" else env.fps
-        if rate != wanted_rate:
+        control = getattr(env, "control", "macro")
+        rate = 0 if control == "macro" else env.fps
+        if policy.control.rate != rate:
             raise ValueError(
-                f"policy.control.rate={rate:g} does not fit env.control={control}; set --policy.control.rate="
-                f"{wanted_rate} (0: an action is a whole macro step; {env.fps}: one tick of control=servo)"
+                f"policy.control.rate={policy.control.rate:g} does not fit env.control={control}: "
+                f"set --policy.control.rate={rate} or another --env.control (macro: a step is a whole motion, rate 0; "
+                f"servo: a step is one of {env.fps} ticks per second)"
             )
     offered = env_to_policy_features(env)
     wanted = policy.input_features or {}

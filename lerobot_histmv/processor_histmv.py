@@ -130,7 +130,8 @@ def check_depth(key: str, depth: Float[Tensor, "*steps 1 y x"]) -> Bool[Tensor, 
     Raises:
         ValueError: depth is not finite, or seems to be in metres.
     """
-    largest = depth.flatten(-3).amax(dim=-1)
+    smallest, largest = depth.flatten(-3).aminmax(dim=-1)  # NaN and infinity show in one of the two
+    check_finite(key, smallest)
     check_finite(key, largest)
     sees = largest > 0
     if (largest[sees] < METRE_LIMIT).any():
@@ -143,7 +144,8 @@ def check_depth(key: str, depth: Float[Tensor, "*steps 1 y x"]) -> Bool[Tensor, 
 
 def check_colours(key: str, colours: Tensor) -> None:
     """Raise ValueError if colours are not finite or exceed [0, 1]."""
-    largest = colours.amax()
+    smallest, largest = colours.aminmax()
+    check_finite(key, smallest)
     check_finite(key, largest)
     if largest > 1 + 1e-3:
         raise ValueError(f"{key} reaches {float(largest):.3g}, but colours must lie in [0, 1]; divide bytes by 255")

@@ -8,6 +8,7 @@ from tiny_policy import episode, observation, stack, tiny_config, tiny_policy
 from lerobot_histmv import keys
 from lerobot_histmv.control import ControlConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
+from lerobot_histmv.processor_histmv import make_histmv_pre_post_processors
 
 STEPS = 3
 POSE = slice(0, len(keys.POSE_NAMES))
@@ -114,6 +115,21 @@ def test_a_state_with_nan_stops_the_policy_also_between_decisions(policy, ticks:
     bad[keys.STATE][0, component] = np.nan
     with pytest.raises(ValueError, match="not finite"):
         policy.select_action(bad)
+
+
+INPUTS = [keys.STATE, keys.INTRINSICS, keys.EXTRINSICS, keys.rgb_key("front"), keys.depth_key("wrist")]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("key", INPUTS)
+def test_one_number_that_is_not_finite_anywhere_in_the_input_stops_at_the_door(key: str, value: float) -> None:
+    before, _ = make_histmv_pre_post_processors(tiny_config())
+    batch = observation(episode(1), 0)
+    before(dict(batch))
+    values = batch[key].clone()
+    values.flatten()[values.numel() // 2] = value
+    with pytest.raises(ValueError, match=f"{key} holds NaN or infinity"):
+        before(batch | {key: values})
 
 
 def test_a_gripper_that_is_not_finite_is_no_command(policy) -> None:
