@@ -100,16 +100,22 @@ class HeldStep:
         self._moving = self._timed_out = False
         self._waited = self._rest = 0
 
-    def begin(self, decision: Float[np.ndarray, " 8"]) -> None:
-        """Start a macro step towards ``decision`` (``keys.POSE_NAMES``)."""
+    def begin(self, decision: Float[np.ndarray, " 8"], state: Float[np.ndarray, " 8"]) -> Float[np.ndarray, " 8"]:
+        """Start a macro step towards ``decision`` (``keys.POSE_NAMES``), and give the command for its first tick.
+
+        Raises:
+            ValueError: the state is no pose.
+        """
         self._set_path(self._inside(Pose(decision[:3], unit_quaternion(decision[3:7], "the decision's quaternion"))))
         self._next_gripper = float(decision[7] > 0.5)
         self._moving, self._timed_out, self._waited = True, False, 0
         drive = self._config.gripper_time if self._next_gripper != self._gripper else 0.0
         self._rest = self._config.ticks(drive) + self._config.ticks(self._config.settle_time)
+        self._advance(measured_pose(state))
+        return make_action(self._output, self._gripper)
 
     def output(self, state: Float[np.ndarray, " 8"]) -> Float[np.ndarray, " 8"] | None:
-        """Command for the coming tick (``keys.POSE_NAMES``), float32; None when the step is over and a decision is due.
+        """Command for the coming tick (``keys.POSE_NAMES``), float32; None when a decision is due.
 
         Raises:
             ValueError: the state is no pose.

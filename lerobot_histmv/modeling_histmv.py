@@ -178,15 +178,20 @@ class HistMVPolicy(PreTrainedPolicy):
         if not self._held:
             low, high = (corner.double().cpu().numpy() for corner in self._box())
             self._held = [HeldStep(self.config.control, low, high, state) for state in states]
-        outputs = [held.output(state) for held, state in zip(self._held, states, strict=True)]
-        due = [row for row, output in enumerate(outputs) if output is None]
+        outputs = np.zeros(states.shape, np.float32)
+        due = []
+        for row, state in enumerate(states):
+            output = self._held[row].output(state)
+            if output is None:
+                due.append(row)
+            else:
+                outputs[row] = output
         if due:
             seen = {key: value[due] for key, value in batch.items() if key.startswith(keys.OBS_PREFIX)}
             decided = self._decide(seen | {"task": [batch["task"][row] for row in due]}, past, due)
             for row, decision in zip(due, decided.double().cpu().numpy(), strict=True):
-                self._held[row].begin(decision)
-                outputs[row] = self._held[row].output(states[row])
-        return torch.from_numpy(np.stack(outputs)).to(batch[keys.STATE].device)
+                outputs[row] = self._held[row].begin(decision, states[row])
+        return torch.from_numpy(outputs).to(batch[keys.STATE].device)
 
     def _decide(self, batch: Batch, past: Past, rows: Sequence[int]) -> Float[Tensor, "n 8"]:
         """Key poses of the environments ``rows``, whose observations alone are in the batch."""

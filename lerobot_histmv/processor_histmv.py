@@ -110,9 +110,11 @@ def separate_calibration(observation: dict[str, Any], cameras: int) -> dict[str,
 
     See ``keys.calibration_state_names``. An observation that has the calibration already, or too short a state, stays.
     """
-    state = observation.get(keys.STATE)
-    rest = 0 if state is None else state.shape[-1] - 16 * cameras
-    if keys.INTRINSICS in observation or rest < len(keys.POSE_NAMES):
+    if keys.STATE not in observation or keys.INTRINSICS in observation:
+        return observation
+    state = observation[keys.STATE]
+    rest = state.shape[-1] - 16 * cameras
+    if rest < len(keys.POSE_NAMES):
         return observation
     parts = state.split([rest, 4 * cameras, 12 * cameras], dim=-1)
     return observation | dict(zip((keys.STATE, keys.INTRINSICS, keys.EXTRINSICS), parts, strict=True))

@@ -86,11 +86,12 @@ def test_decisions_held_at_20_hz_do_what_macro_steps_do(task: str) -> None:
         held = HeldStep(CONTROL, REACH_LOW, REACH_HIGH, seen["agent_pos"][:8].astype(np.float64))
         success = False
         for decision in expert_actions(env):
-            held.begin(decision)
-            while (output := held.output(seen["agent_pos"][:8].astype(np.float64))) is not None:
+            output = held.begin(decision, seen["agent_pos"][:8].astype(np.float64))
+            while output is not None:
                 seen, _, terminated, truncated, _ = env.step(output)
                 success |= terminated
                 assert not truncated or success
+                output = held.output(seen["agent_pos"][:8].astype(np.float64))
         assert success, f"{task}, scene {seed}"
     env.close()
 

@@ -45,11 +45,9 @@ def held(config: ControlConfig = CONFIG, state: np.ndarray = START) -> HeldStep:
 
 def follow(step: HeldStep, decision: np.ndarray, state: np.ndarray = START) -> list[np.ndarray]:
     """Outputs of one macro step with an arm that is, one tick later, where it was told to be."""
-    step.begin(decision)
-    outputs: list[np.ndarray] = []
-    while (output := step.output(state)) is not None:
+    outputs = [step.begin(decision, state)]
+    while (output := step.output(outputs[-1].astype(np.float64))) is not None:
         outputs.append(output)
-        state = output.astype(np.float64)
     return outputs
 
 
@@ -60,17 +58,16 @@ def test_no_output_leaves_the_box_or_exceeds_the_speeds(config, start, decisions
     inside = np.concatenate([np.clip(start[:3], LOW, HIGH), start[3:]])
     step, last, state = held(config, inside), inside, inside
     for decision in decisions:
-        step.begin(decision)
+        output = step.begin(decision, state)
         for _ in range(50):
-            output = step.output(state)
-            if output is None:
-                break
             assert ((output[:3] >= LOW - 1e-6) & (output[:3] <= HIGH + 1e-6)).all()
             assert np.linalg.norm(output[:3] - last[:3]) <= 1.001 * config.speed / config.rate + 1e-6
             assert angle_between(output[3:7], last[3:7]) <= 1.001 * config.turn_rate / config.rate + 2e-3
             assert output[7] in (0, 1)
             last = output.astype(np.float64)
             state = chance.choice([last, last, last, state, start])
+            if (output := step.output(state)) is None:
+                break
 
 
 @FEW
@@ -105,8 +102,7 @@ def test_decisions_outside_of_the_box_are_clipped_to_it() -> None:
 
 def test_an_arm_that_does_not_move_ends_the_step_in_time_where_it_is() -> None:
     step = held()
-    step.begin(GOAL)
-    outputs = []
+    outputs = [step.begin(GOAL, START)]
     while (output := step.output(START)) is not None:
         outputs.append(output)
     path = len(timed_path([top_down(START[:3]), top_down(GOAL[:3], 0.8)], CONFIG.speed))
@@ -118,7 +114,7 @@ def test_an_arm_that_does_not_move_ends_the_step_in_time_where_it_is() -> None:
 
 def test_a_slow_arm_is_waited_for() -> None:
     step, state = held(replace(CONFIG, timeout=60)), START.copy()
-    step.begin(np.concatenate([GOAL[:3], START[3:]]))
+    step.begin(np.concatenate([GOAL[:3], START[3:]]), state)
     arrived = []
     while (output := step.output(state)) is not None:
         assert np.linalg.norm(output[:3] - state[:3]) <= CONFIG.lead + 1e-6
@@ -136,7 +132,7 @@ def test_a_measurement_that_is_not_finite_stops_with_an_error(component: int, va
     with pytest.raises(ValueError, match="not finite"):
         held(state=bad)
     step = held()
-    step.begin(GOAL)
+    step.begin(GOAL, START)
     with pytest.raises(ValueError, match="not finite"):
         step.output(bad)
 
