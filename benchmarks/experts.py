@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from dataset_tools.shards import write_json
 from lerobot_histmv.envs import TASKS, UR5Env, make
-from lerobot_histmv.envs.motion import make_action
+from lerobot_histmv.motion import make_action
 
 RESULTS = Path(__file__).parent / "results" / "experts.json"
 FIRST_SEED = 500_000

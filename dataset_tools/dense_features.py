@@ -11,10 +11,6 @@ import numpy as np
 from lerobot_histmv import keys
 
 ROBOT_TYPE = "ur5e"
-JOINT_NAMES = tuple(
-    f"{joint}.pos" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-)
-"""The six joint angles [rad] that follow the measured pose in ``observation.state``."""
 
 
 def dense_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[str, Any]]:
@@ -28,7 +24,7 @@ def dense_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[st
         Per camera an RGB and a depth image (uint16 mm, 0 = invalid), then state (14), intrinsics (4 per camera: fx fy
         cx cy), extrinsics (12 per camera: rows of the 3x4 ``T_world_cam``) and action (8), all float32.
     """
-    return arm_features(dict.fromkeys(cameras, (image_size, image_size)), JOINT_NAMES)
+    return arm_features(dict.fromkeys(cameras, (image_size, image_size)), keys.JOINT_NAMES)
 
 
 def arm_features(sizes: Mapping[str, tuple[int, int]], joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -94,8 +94,15 @@ def check_fits(policy: PreTrainedConfig, env: EnvConfig) -> None:
     Raises:
         ValueError: names what differs and the option that cures it.
     """
-    if policy.type == "histmv" and getattr(env, "control", "macro") != "macro":
-        raise ValueError(f"env.control={env.control}: an action of histmv is a whole motion; set --env.control=macro")
+    if policy.type == "histmv":
+        control = getattr(env, "control", "macro")
+        rate = 0 if control == "macro" else env.fps
+        if policy.control.rate != rate:
+            raise ValueError(
+                f"policy.control.rate={policy.control.rate:g} does not fit env.control={control}: "
+                f"set --policy.control.rate={rate} or another --env.control (macro: a step is a whole motion, rate 0; "
+                f"servo: a step is one of {env.fps} ticks per second)"
+            )
     offered = env_to_policy_features(env)
     wanted = policy.input_features or {}
     cameras, env_cameras = (list(getattr(config, "cameras", [])) for config in (policy, env))

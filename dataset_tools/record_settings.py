@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
-from lerobot_histmv.envs.motion import TICK
+from lerobot_histmv.motion import TICK
 
 CONTROL_RATE = round(1 / TICK)
 """Ticks per second at which the expert acts."""

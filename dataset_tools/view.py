@@ -14,7 +14,7 @@ from dataset_tools.eval_settings import REPORTED_SEEDS
 from dataset_tools.record import RecordEnvConfig
 from dataset_tools.video import VideoWriter
 from lerobot_histmv.envs import UR5Env, make
-from lerobot_histmv.envs.motion import TICK
+from lerobot_histmv.motion import TICK
 
 END_FRAMES = 20
 """The last picture of a video stays for a second."""

@@ -9,6 +9,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_histmv import keys
+from lerobot_histmv.control import ControlConfig
 from lerobot_histmv.model.augment import AugmentConfig
 from lerobot_histmv.model.config import LossConfig, NetworkConfig
 
@@ -30,6 +31,7 @@ class HistMVConfig(PreTrainedConfig):
         network: sizes and switches of the network.
         loss: weights and forms of the loss terms.
         augment: strengths of the augmentation.
+        control: how a decision becomes outputs: whole macro steps, or the ticks of a control loop.
         cameras: views in the order of the calibration; read from the dataset when empty.
         instructions: recorded instruction -> its paraphrases, among which training draws; read from the dataset when
             empty.
@@ -44,6 +46,7 @@ class HistMVConfig(PreTrainedConfig):
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
     cameras: list[str] = field(default_factory=list)
     instructions: dict[str, list[str]] = field(default_factory=dict)
     optimizer_lr: float = 1e-3

@@ -26,6 +26,11 @@ INTRINSICS_FIELDS = ("fx", "fy", "cx", "cy")
 EXTRINSICS_FIELDS = tuple(f"{kind}{axis}" for axis in "xyz" for kind in ("r0", "r1", "r2", "t"))
 """Rows of the 3x4 ``T_world_cam``: row x is ``r0x r1x r2x tx``, and so on."""
 
+JOINT_NAMES = tuple(
+    f"{joint}.pos" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+)
+"""The six joint angles [rad] that follow the measured pose in the UR5e's ``observation.state``."""
+
 SOURCE_EPISODE = "keyframe.source_episode"
 SOURCE_FRAME = "keyframe.source_frame"
 SOURCE_TIMESTAMP = "keyframe.source_timestamp"
@@ -60,6 +65,14 @@ def intrinsics_names(cameras: Sequence[str]) -> list[str]:
 def extrinsics_names(cameras: Sequence[str]) -> list[str]:
     """Feature names of ``observation.camera_extrinsics``: the rows of each camera's 3x4 ``T_world_cam``."""
     return [f"{camera}.{field}" for camera in cameras for field in EXTRINSICS_FIELDS]
+
+
+def calibration_state_names(cameras: Sequence[str]) -> list[str]:
+    """Names under which a LeRobot ``Robot`` gives intrinsics, then extrinsics, as the last numbers of its state.
+
+    ``lerobot-rollout`` hands to a policy only images and numbers whose names end in ``.pos``, joined to one state.
+    """
+    return [f"{name}.pos" for name in (*intrinsics_names(cameras), *extrinsics_names(cameras))]
 
 
 def cameras_of(names: Sequence[str]) -> list[str]:

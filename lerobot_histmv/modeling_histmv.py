@@ -1,12 +1,13 @@
 """The HistMV policy: windows, loss and the memory of past steps around ``HistMVNet``."""
 
 import logging
-from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 import torch
-from einops import rearrange, repeat
+from einops import rearrange
 from huggingface_hub import ModelCard
 from jaxtyping import Float, Int
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.control import HeldStep
 from lerobot_histmv.data.instructions import load_paraphrases, meanings
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.decoder import Prediction
@@ -21,7 +23,8 @@ from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
 from lerobot_histmv.model.view_attention import ViewAttention, best_shares, choice_loss, ranking_loss
 from lerobot_histmv.model_card import model_card
-from lerobot_histmv.windows import Window, causal_heat, read_window, row_weights
+from lerobot_histmv.past import Past
+from lerobot_histmv.windows import Window, read_window, row_weights
 
 Batch = dict[str, Any]
 MEANINGS = 12
@@ -44,6 +47,15 @@ class Decision:
     view: Int[Tensor, " b"]
     heat: Float[Tensor, "b y x"]
     surface: Float[Tensor, "b 3"]
+
+    def updated(self, rows: Sequence[int], newer: "Decision") -> "Decision":
+        """This one with the environments ``rows`` replaced by ``newer``, in their order."""
+        return Decision(
+            **{
+                name: old.index_copy(0, torch.tensor(rows, device=old.device), getattr(newer, name))
+                for name, old in ((field.name, getattr(self, field.name)) for field in fields(self))
+            }
+        )
 
 
 class HistMVPolicy(PreTrainedPolicy):
@@ -93,10 +105,9 @@ class HistMVPolicy(PreTrainedPolicy):
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def reset(self) -> None:
-        """Forget all past steps; call it whenever the environments are reset."""
-        steps = self.config.network.history.memory + 1
-        self._fused: deque[Float[Tensor, "b d kh w"]] = deque(maxlen=steps)
-        self._tools: deque[Float[Tensor, "b 3"]] = deque(maxlen=steps)
+        """Forget all past steps and held targets; call it whenever the environments are reset."""
+        self._past: Past | None = None
+        self._held: list[HeldStep] = []
         self.last_decision: Decision | None = None
 
     def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
@@ -149,24 +160,55 @@ class HistMVPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: Batch, **_: Any) -> Float[Tensor, "b 8"]:
-        """Next key pose of each environment: position [m], quaternion wxyz, gripper 1 open or 0 closed."""
-        if self._fused and len(self._fused[0]) != len(batch[keys.STATE]):
-            raise ValueError(
-                f"{len(batch[keys.STATE])} environments, but the memory holds {len(self._fused[0])}: call reset() first"
-            )
+        """Next target of each environment: position [m], quaternion wxyz, gripper 1 open or 0 closed.
+
+        With ``config.control.rate`` 0 that is the next key pose. Otherwise it is the next tick's target on the way
+        there; an environment decides anew, and remembers what it sees, only when its macro step is over.
+
+        Raises:
+            ValueError: an input or the action is not finite, or the number of environments changed without ``reset``.
+        """
+        states = batch[keys.STATE]
+        if self._past is None:
+            self._past = Past(len(states), self.config.network.history.memory + 1)
+        if len(self._past) != len(states):
+            raise ValueError(f"{len(states)} environments, but the memory holds {len(self._past)}: call reset() first")
+        if not self.config.control.rate:
+            return self._decide(batch, self._past, range(len(states)))
+        return self._hold(batch, self._past)
+
+    def _hold(self, batch: Batch, past: Past) -> Float[Tensor, "b 8"]:
+        """The next tick's output of each environment; those whose macro step is over decide first."""
+        states = batch[keys.STATE][:, : len(keys.POSE_NAMES)].double().cpu().numpy()
+        if not self._held:
+            low, high = (corner.double().cpu().numpy() for corner in self._box())
+            self._held = [HeldStep(self.config.control, low, high, state) for state in states]
+        outputs = np.zeros(states.shape, np.float32)
+        due = []
+        for row, state in enumerate(states):
+            output = self._held[row].output(state)
+            if output is None:
+                due.append(row)
+            else:
+                outputs[row] = output
+        if due:
+            seen = {key: value[due] for key, value in batch.items() if key.startswith(keys.OBS_PREFIX)}
+            decided = self._decide(seen | {"task": [batch["task"][row] for row in due]}, past, due)
+            for row, decision in zip(due, decided.double().cpu().numpy(), strict=True):
+                outputs[row] = self._held[row].begin(decision, states[row])
+        return torch.from_numpy(outputs).to(batch[keys.STATE].device)
+
+    def _decide(self, batch: Batch, past: Past, rows: Sequence[int]) -> Float[Tensor, "n 8"]:
+        """Key poses of the environments ``rows``, whose observations alone are in the batch."""
         window = read_window(batch, self.config.cameras)
-        self._tools.append(window.tool)
-        age = torch.arange(len(self._tools) - 1, -1, -1, device=window.tool.device)
-        heat = repeat(causal_heat(age), "p -> b p", b=len(window.tool))
         text = self.net.semantics.text(self._known(batch["task"]), window.tool.device)
-        seen = window.observe(text, torch.stack(list(self._tools), dim=1), heat)
-        encoding = self.net.encode(seen)
-        self._fused.append(encoding.fused)
-        real = torch.ones(len(window.tool), len(self._fused), dtype=torch.bool, device=window.tool.device)
-        fused = rearrange(torch.stack(list(self._fused), dim=1), "b t d h w -> (b t) d h w")
-        enriched = self.net.remember(fused, text.repeat_interleave(len(self._fused), dim=0), real)
-        predicted, views = self.net.decode_best(encoding, enriched[len(self._fused) - 1 :: len(self._fused)])
-        self.last_decision = self._decision(encoding, predicted, views[:, 1])
+        encoding = self.net.encode(window.observe(text, *past.add_tools(rows, window.tool)))
+        fused, real = past.add_maps(rows, encoding.fused)
+        count = real.sum(dim=1)
+        enriched = self.net.remember(fused, text.repeat_interleave(count, dim=0), real)
+        predicted, views = self.net.decode_best(encoding, enriched[count.cumsum(dim=0) - 1])
+        decision = self._decision(encoding, predicted, views[:, 1])
+        self.last_decision = self.last_decision.updated(rows, decision) if self.last_decision else decision
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)
 
     def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Float[Tensor, "b 1 8"]:
@@ -176,13 +218,21 @@ class HistMVPolicy(PreTrainedPolicy):
     def _action(
         self, position: Float[Tensor, "b 3"], quaternion: Float[Tensor, "b 4"], gripper: Float[Tensor, " b"]
     ) -> Float[Tensor, "b 8"]:
-        workspace = self.net.workspace
-        position = torch.minimum(torch.maximum(position, workspace.low), workspace.high)
         canonical = torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
-        action = torch.cat([position, canonical, (gripper > 0).to(position.dtype)[:, None]], dim=-1)
-        if not action.isfinite().all():
-            raise ValueError(f"the policy's action is not finite: {action.tolist()}; check the observation for NaN")
-        return action
+        pose = torch.cat([torch.clamp(position, *self._box()), canonical], dim=-1)
+        if not (pose.isfinite().all() and gripper.isfinite().all()):
+            raise ValueError(
+                f"the policy's action is not finite: {pose.tolist()}, gripper {gripper.tolist()}; "
+                "check the observation for NaN"
+            )
+        return torch.cat([pose, (gripper > 0).to(pose.dtype)[:, None]], dim=-1)
+
+    def _box(self) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+        """Lower and upper corner [m] of the box that no output leaves."""
+        workspace, corners = self.net.workspace, self.config.control.box
+        if not corners:
+            return workspace.low, workspace.high
+        return workspace.low.new_tensor(corners[:3]), workspace.high.new_tensor(corners[3:])
 
     @staticmethod
     def _decision(encoding: Encoding, predicted: Prediction, view: Int[Tensor, " b"]) -> Decision:

@@ -56,7 +56,7 @@ class CheckInputStep(ProcessorStep):
                 quaternion is not unit.
         """
         new = transition.copy()
-        observation = dict(new[TransitionKey.OBSERVATION] or {})
+        observation = separate_calibration(dict(new[TransitionKey.OBSERVATION] or {}), len(self.cameras))
         seeing = {}
         for camera in self.cameras:
             for key in (keys.rgb_key(camera), keys.depth_key(camera)):
@@ -105,6 +105,21 @@ class CheckInputStep(ProcessorStep):
         return features
 
 
+def separate_calibration(observation: dict[str, Any], cameras: int) -> dict[str, Any]:
+    """The observation with the calibration taken out of the state's end, where a ``Robot`` has to put it.
+
+    See ``keys.calibration_state_names``. An observation that has the calibration already, or too short a state, stays.
+    """
+    if keys.STATE not in observation or keys.INTRINSICS in observation:
+        return observation
+    state = observation[keys.STATE]
+    rest = state.shape[-1] - 16 * cameras
+    if rest < len(keys.POSE_NAMES):
+        return observation
+    parts = state.split([rest, 4 * cameras, 12 * cameras], dim=-1)
+    return observation | dict(zip((keys.STATE, keys.INTRINSICS, keys.EXTRINSICS), parts, strict=True))
+
+
 def check_finite(key: str, values: Tensor) -> None:
     """Raise ValueError if ``values`` holds NaN or infinity."""
     if not torch.isfinite(values).all():
@@ -117,7 +132,8 @@ def check_depth(key: str, depth: Float[Tensor, "*steps 1 y x"]) -> Bool[Tensor, 
     Raises:
         ValueError: depth is not finite, or seems to be in metres.
     """
-    largest = depth.flatten(-3).amax(dim=-1)
+    smallest, largest = depth.flatten(-3).aminmax(dim=-1)  # NaN and infinity show in one of the two
+    check_finite(key, smallest)
     check_finite(key, largest)
     sees = largest > 0
     if (largest[sees] < METRE_LIMIT).any():
@@ -130,7 +146,8 @@ def check_depth(key: str, depth: Float[Tensor, "*steps 1 y x"]) -> Bool[Tensor, 
 
 def check_colours(key: str, colours: Tensor) -> None:
     """Raise ValueError if colours are not finite or exceed [0, 1]."""
-    largest = colours.amax()
+    smallest, largest = colours.aminmax()
+    check_finite(key, smallest)
     check_finite(key, largest)
     if largest > 1 + 1e-3:
         raise ValueError(f"{key} reaches {float(largest):.3g}, but colours must lie in [0, 1]; divide bytes by 255")

@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from lerobot_histmv.envs.motion import MAX_SPEED, TICK, Motion, Pose, Tick, make_action, timed_path
 from lerobot_histmv.envs.simulation import ELBOW_UP, Simulation
 from lerobot_histmv.geometry import angle_between
+from lerobot_histmv.motion import MAX_SPEED, TICK, Motion, Pose, Tick, make_action, timed_path
 
 ARRIVED = 0.002
 """The arm has arrived when the tool is this close [m] ..."""

@@ -8,11 +8,11 @@ from jaxtyping import Float, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
 from lerobot_histmv.envs.disturbances import Disturbances
-from lerobot_histmv.envs.motion import TICK, Motion
 from lerobot_histmv.envs.sensor_noise import CARD_WIDTH, hide_behind_card, noisy_colors, stereo_depth
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import WORKSPACE
 from lerobot_histmv.envs.tasks.colors import COLORS, HELD_OUT_COLORS
+from lerobot_histmv.motion import TICK, Motion
 
 BRIGHTNESS, LIGHT_ANGLE = 0.4, np.radians(15)
 CAMERA_SHIFT, CAMERA_TURN, FOCAL_ERROR = 0.005, np.radians(0.5), 0.01

@@ -6,9 +6,9 @@ import numpy as np
 from gymnasium import spaces
 
 from lerobot_histmv import geometry, keys
-from lerobot_histmv.envs.motion import Pose
 from lerobot_histmv.envs.tasks import suites
 from lerobot_histmv.envs.tasks.base import SPLITS
+from lerobot_histmv.motion import Pose
 
 CAMERA_NAMES = ("front", "left_shoulder", "wrist")
 CONTROLS = ("macro", "servo")

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from lerobot_histmv.envs.motion import Pose
 from lerobot_histmv.envs.scene import arm_spec
 from lerobot_histmv.geometry import canonical
+from lerobot_histmv.motion import Pose
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 POSITION_TOLERANCE = 1e-4

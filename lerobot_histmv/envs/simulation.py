@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from lerobot_histmv.envs import scene
 from lerobot_histmv.envs.kinematics import JOINTS, ArmKinematics, pose_at
-from lerobot_histmv.envs.motion import TICK, Point, Pose, top_down
 from lerobot_histmv.geometry import quaternion_from_matrix
+from lerobot_histmv.motion import TICK, Point, Pose, top_down
 
 HOME = top_down((0.28, 0.0, 0.40))
 """Tool pose at the start of every episode: above the near edge of the workspace, pointing down."""

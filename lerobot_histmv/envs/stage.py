@@ -11,9 +11,9 @@ from lerobot_histmv.envs.camera import Renderer, samples_for
 from lerobot_histmv.envs.controller import Controller
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.disturber import Disturber
-from lerobot_histmv.envs.motion import Motion
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import Task
+from lerobot_histmv.motion import Motion
 
 SETTLE_TICKS = 10
 """Ticks before an episode starts: objects come to rest and the gripper takes its initial command."""

@@ -11,8 +11,8 @@ from lerobot_histmv import keys
 from lerobot_histmv.envs import interface
 from lerobot_histmv.envs.disturbances import CLEAN, Disturbances
 from lerobot_histmv.envs.interface import CAMERA_NAMES
-from lerobot_histmv.envs.motion import Motion, Tick
 from lerobot_histmv.envs.tasks import suites
+from lerobot_histmv.motion import Motion, Tick
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.stage import Stage

@@ -230,6 +230,10 @@ class NetworkConfig:
             raise ValueError("texture.encoder='none' and semantics.image='none' together leave nothing of the colours")
         if self.width % self.history.heads:
             raise ValueError(f"width ({self.width}) must be divisible by history.heads ({self.history.heads})")
-        low, high = self.workspace[:3], self.workspace[3:]
-        if len(self.workspace) != 6 or any(a >= b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"workspace={self.workspace} must be x0 y0 z0 x1 y1 z1 with each lower < upper [m]")
+        check_box("workspace", self.workspace)
+
+
+def check_box(name: str, corners: tuple[float, ...]) -> None:
+    """Raise ValueError unless ``corners`` are the lower and the upper corner [m] of a box."""
+    if len(corners) != 6 or not all(low < high for low, high in zip(corners[:3], corners[3:], strict=True)):
+        raise ValueError(f"{name}={corners} must be x0 y0 z0 x1 y1 z1 with each lower < upper [m]")

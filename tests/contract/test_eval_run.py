@@ -175,10 +175,14 @@ def test_images_of_another_size_are_refused(checkpoint: Path, tmp_path: Path) ->
         run(config)
 
 
-def test_control_by_ticks_is_refused(checkpoint: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("control", "rate", "wanted"), [("servo", 0, 20), ("servo", 30, 20), ("macro", 20, 0)])
+def test_ticks_of_policy_and_environment_must_fit(
+    control: str, rate: int, wanted: int, checkpoint: Path, tmp_path: Path
+) -> None:
     config = settings(checkpoint, tmp_path)
-    config.env = UR5EnvConfig(cameras=list(CAMERAS), control="servo")
-    with pytest.raises(ValueError, match=r"--env\.control=macro"):
+    config.env = UR5EnvConfig(cameras=list(CAMERAS), control=control)
+    config.policy.overrides.append(f"--control.rate={rate}")
+    with pytest.raises(ValueError, match=rf"--policy\.control\.rate={wanted} "):
         run(config)
 
 

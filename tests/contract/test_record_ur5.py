@@ -8,7 +8,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from dataset_tools.assembly import assemble
-from dataset_tools.dense_features import JOINT_NAMES, dense_features
+from dataset_tools.dense_features import dense_features
 from dataset_tools.record_worker import Worker, WorkerSetup
 from dataset_tools.shards import Outcome, shard_path
 from lerobot_histmv import keys
@@ -41,7 +41,7 @@ def column(dataset: LeRobotDataset, key: str) -> np.ndarray:
 def test_columns_are_named_and_typed(episode: tuple[Outcome, Path, LeRobotDataset]) -> None:
     features = episode[2].meta.features
     assert features[keys.ACTION]["names"] == list(keys.POSE_NAMES)
-    assert features[keys.STATE]["names"] == [*keys.POSE_NAMES, *JOINT_NAMES]
+    assert features[keys.STATE]["names"] == [*keys.POSE_NAMES, *keys.JOINT_NAMES]
     assert features[keys.INTRINSICS]["names"][:5] == ["front.fx", "front.fy", "front.cx", "front.cy", "wrist.fx"]
     assert keys.cameras_of(features[keys.EXTRINSICS]["names"]) == list(CAMERAS)
     assert episode[2].meta.depth_keys == [keys.depth_key(camera) for camera in CAMERAS]

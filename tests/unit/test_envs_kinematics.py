@@ -6,9 +6,9 @@ import pytest
 pytest.importorskip("mujoco")
 
 from lerobot_histmv.envs.kinematics import POSITION_TOLERANCE, ROTATION_TOLERANCE, ArmKinematics
-from lerobot_histmv.envs.motion import top_down
 from lerobot_histmv.envs.simulation import ELBOW_UP
 from lerobot_histmv.geometry import angle_between
+from lerobot_histmv.motion import top_down
 
 
 @pytest.fixture(scope="module")

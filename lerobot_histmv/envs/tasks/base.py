@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from lerobot_histmv.envs.motion import Motion
+from lerobot_histmv.motion import Motion
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

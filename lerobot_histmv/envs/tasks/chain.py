@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Motion
 from lerobot_histmv.envs.tasks.base import Region, Task
+from lerobot_histmv.motion import Motion
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

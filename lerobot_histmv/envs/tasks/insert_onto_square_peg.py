@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Motion
 from lerobot_histmv.envs.tasks.base import RETREAT, Region, Task
 from lerobot_histmv.envs.tasks.colors import COLORS
+from lerobot_histmv.motion import Motion
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Motion, Pose, top_down
 from lerobot_histmv.envs.tasks.base import nearest_turn, scatter
 from lerobot_histmv.envs.tasks.colors import COLORS, ColorTask
+from lerobot_histmv.motion import Motion, Pose, top_down
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Pose, top_down
 from lerobot_histmv.envs.tasks.base import scatter
 from lerobot_histmv.envs.tasks.pick_and_lift import PickAndLift
+from lerobot_histmv.motion import Pose, top_down
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lerobot_histmv.envs.motion import Motion
 from lerobot_histmv.envs.tasks.colors import COLORS, ColorTask
 from lerobot_histmv.envs.tasks.pick_up_cup import rim_grasp, stand_cups
+from lerobot_histmv.motion import Motion
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation

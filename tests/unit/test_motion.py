@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lerobot_histmv.envs.motion import MAX_TURN_RATE, TICK, Motion, Pose, timed_path, top_down
 from lerobot_histmv.geometry import angle_between, canonical
+from lerobot_histmv.motion import MAX_TURN_RATE, TICK, Motion, Pose, timed_path, top_down
 
 SPEED = 0.3
 START, VIA, END = top_down((0.3, 0.0, 0.4)), top_down((0.5, 0.2, 0.16), 0.6), top_down((0.5, 0.2, 0.02), 0.6)

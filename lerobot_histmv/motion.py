@@ -146,17 +146,19 @@ def _geometric_path(waypoints: Sequence[Pose]) -> tuple[Float[np.ndarray, "n 3"]
     return positions, Rotation.from_rotvec(steps[index] * _smoothstep(fraction)[:, None]) * turns[index]
 
 
-def timed_path(waypoints: Sequence[Pose], speed: float) -> list[Pose]:
-    """Poses at the end of every tick of one smooth motion through ``waypoints`` (the first is where the tool is).
+def timed_path(
+    waypoints: Sequence[Pose], speed: float, turn_rate: float = MAX_TURN_RATE, tick: float = TICK
+) -> list[Pose]:
+    """Poses at the end of every ``tick`` [s] of one smooth motion through ``waypoints`` (the first is where it starts).
 
-    The motion starts and ends at rest and keeps to ``speed``, ``MAX_TURN_RATE`` and ``MAX_ACCELERATION``.
+    The motion starts and ends at rest and keeps to ``speed`` [m/s], ``turn_rate`` [rad/s] and ``MAX_ACCELERATION``.
     """
     positions, rotations = _geometric_path(waypoints)
     moved = np.linalg.norm(np.diff(positions, axis=0), axis=1) / speed
-    turned = (rotations[1:] * rotations[:-1].inv()).magnitude() / MAX_TURN_RATE
+    turned = (rotations[1:] * rotations[:-1].inv()).magnitude() / turn_rate
     clock = np.concatenate([[0], np.cumsum(np.maximum(moved, turned))])
     duration = max(1.5 * clock[-1], np.sqrt(6 * clock[-1] * speed / MAX_ACCELERATION))
-    ticks = max(1, int(np.ceil(duration / TICK)))
+    ticks = max(1, int(np.ceil(duration / tick)))
     when = _smoothstep(np.arange(1, ticks + 1) / ticks) * clock[-1]
     place = np.interp(when, clock, np.arange(len(clock)))
     low = np.minimum(place.astype(int), len(clock) - 2)
