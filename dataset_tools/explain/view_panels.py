@@ -31,7 +31,7 @@ def draw_weights(episode: Explained) -> Figure:
     n = len(episode.records)
     rows = -(-n // PER_ROW)
     figure = new_figure(1.75 * rows + 3.0)
-    above, below = figure.subfigures(2, 1, height_ratios=(1.75 * rows, 3.0))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75 * rows, 3.0))[:, 0]
     grid = above.subplots(rows, PER_ROW, squeeze=False).ravel()
     for axes in grid:
         axes.set(xticks=[], yticks=[])
