@@ -46,7 +46,7 @@ def draw_board(records: Sequence[Record], truth: Float[np.ndarray, " 8"] | None 
 def decision_text(record: Record, truth: Float[np.ndarray, " 8"] | None = None) -> str:
     """Where the tool is sent and what the gripper shall do."""
     x, y, z = record.action[:3]
-    gripper = "open" if record.action[7] > 0.5 else "closed"
+    gripper = f"open ({record.opening:.0%})" if record.action[7] > 0.5 else f"closed ({1 - record.opening:.0%})"
     text = f"next pose {x:.3f}, {y:.3f}, {z:.3f} m, gripper {gripper}"
     if truth is None:
         return text
