@@ -40,7 +40,7 @@ PANELS = (
         "views",
         "Which view acted",
         "Each decision in the view that acted, framed in its colour, and the weights of all views over the decisions. "
-        "A dotted line marks where another view takes over.",
+        "A bold name and a dotted line mark where another view takes over.",
         _lacks_nothing,
         draw_weights,
     ),
