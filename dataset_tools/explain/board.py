@@ -46,8 +46,8 @@ def draw_board(records: Sequence[Record], truth: Float[np.ndarray, " 8"] | None 
 def decision_text(record: Record, truth: Float[np.ndarray, " 8"] | None = None) -> str:
     """Where the tool is sent and what the gripper shall do."""
     x, y, z = record.action[:3]
-    gripper = "open" if record.action[7] > 0.5 else "closed"
-    text = f"next pose {x:.3f}, {y:.3f}, {z:.3f} m, gripper {gripper}"
+    gripper, sure = ("open", record.opening) if record.action[7] > 0.5 else ("closed", 1 - record.opening)
+    text = f"next pose {x:.3f}, {y:.3f}, {z:.3f} m, gripper {gripper} ({100 * sure:.0f} %)"
     if truth is None:
         return text
     wrong = "" if (record.action[7] > 0.5) == (truth[7] > 0.5) else ", gripper wrong"

@@ -40,7 +40,7 @@ PANELS = (
         "views",
         "Which view acted",
         "Each decision in the view that acted, framed in its colour, and the weights of all views over the decisions. "
-        "A dotted line marks where another view takes over.",
+        "A bold name and a dotted line mark where another view takes over.",
         _lacks_nothing,
         draw_weights,
     ),
@@ -108,13 +108,20 @@ def notes(episode: Explained) -> list[str]:
 
 
 def decision_table(episode: Explained) -> str:
-    """The decisions as an HTML table."""
-    head = ["", "decision", "acts", *(f"weight x certainty, {camera} [%]" for camera in episode.cameras), "memory [cm]"]
+    """The decisions as an HTML table, folded so that the film comes first."""
+    head = [
+        "",
+        "decision",
+        "acts",
+        *(f"weight x certainty, {camera} [%]" for camera in episode.cameras),
+        "without its past, elsewhere by [cm]",
+    ]
     rows = "".join(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _cells(episode, index)) + "</tr>"
         for index in range(len(episode.records))
     )
-    return "<table><tr>" + "".join(f"<th>{html.escape(title)}</th>" for title in head) + f"</tr>{rows}</table>"
+    titles = "".join(f"<th>{html.escape(title)}</th>" for title in head)
+    return f"<details><summary>all decisions as a table</summary><table><tr>{titles}</tr>{rows}</table></details>"
 
 
 def _cells(episode: Explained, index: int) -> list[str]:

@@ -31,7 +31,7 @@ def draw_weights(episode: Explained) -> Figure:
     n = len(episode.records)
     rows = -(-n // PER_ROW)
     figure = new_figure(1.75 * rows + 3.0)
-    above, below = figure.subfigures(2, 1, height_ratios=(1.75 * rows, 3.0))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75 * rows, 3.0))[:, 0]
     grid = above.subplots(rows, PER_ROW, squeeze=False).ravel()
     for axes in grid:
         axes.set(xticks=[], yticks=[])
@@ -40,7 +40,7 @@ def draw_weights(episode: Explained) -> Figure:
         truth = None if episode.truth is None else episode.truth[index]
         axes.imshow(np.asarray(tile(record, record.chosen, THUMB, truth)))
         changed = index in episode.changes
-        title = f"{index + 1}: {episode.cameras[record.chosen]}{' (changed)' if changed else ''}"
+        title = f"{index + 1}: {episode.cameras[record.chosen]}"
         axes.set_title(title, fontsize=9, color=INK, fontweight="bold" if changed else "normal")
         axes.spines[:].set(visible=True, linewidth=4, color=color_of(record.chosen))
     weights, scores = below.subplots(1, 2, sharex=True)

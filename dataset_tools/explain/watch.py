@@ -4,7 +4,7 @@ The policy runs as it always does. Its modules' inputs and outputs are noted; wh
 weights, information shared between views, what it would have done without a past step) is computed from them.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from dataset_tools.explain.attention import attention_weights, forgotten, step_shares
 from dataset_tools.inspect.cameras import CameraView
 from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.history import SelfAttentionBlock
 from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.network import HistMVNet
 from lerobot_histmv.model.view_attention import normalised_mutual_information
@@ -81,8 +82,12 @@ def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
     """A list to which every ``select_action`` adds its record while this lasts; batches must hold one environment."""
     net, records = policy.net, list[Record]()
     calls: Calls = {}
-    modules = {"views": [net.view_attention], "history": [net.history], "layers": net.history.layers}
-    modules |= {"decoder": [net.decoder]}
+    modules: dict[str, Iterable[nn.Module]] = {
+        "views": [net.view_attention],
+        "history": [net.history],
+        "layers": net.history.layers,
+        "decoder": [net.decoder],
+    }
     handles = [
         module.register_forward_hook(partial(_note, calls, name)) for name, group in modules.items() for module in group
     ]
@@ -120,6 +125,7 @@ def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1
     attention = [
         step_shares(attention_weights(layer, *call.inputs), steps)[0, -1]
         for layer, call in zip(policy.net.history.layers, calls["layers"], strict=True)
+        if isinstance(layer, SelfAttentionBlock)
     ]
     past, chosen = range(steps - 1), _best(weights, predicted)
     memory, opening = _without(policy.net, calls, past)
