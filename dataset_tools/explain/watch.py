@@ -119,8 +119,9 @@ def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1
     """The record of a decision that ``calls`` noted."""
     (views,), (history,), (decoder,) = calls["views"], calls["history"], calls["decoder"]
     maps, weights, predicted = views.inputs[0], views.output, decoder.output
+    projection = policy.net.view_attention.get_buffer("projection")  # there, as one view is decoded
     with full_precision(maps):
-        information = normalised_mutual_information(maps.float(), policy.net.view_attention.projection)
+        information = normalised_mutual_information(maps.float(), projection)
     steps = history.inputs[0].shape[1]
     attention = [
         step_shares(attention_weights(layer, *call.inputs), steps)[0, -1]
