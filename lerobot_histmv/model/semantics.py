@@ -72,7 +72,10 @@ class ClipTowers(nn.Module):
         self.clip = create_clip(config.clip_model, config.clip_pretrained)
         self.trained = config.trained
         self.clip.requires_grad_(self.trained)
-        self.clip.logit_scale.requires_grad_(False)  # only a contrastive loss would use it
+        # Only a contrastive loss would train it, and sharded training refuses parameters that are single numbers.
+        scale = self.clip.logit_scale.detach()
+        del self.clip.logit_scale
+        self.clip.register_buffer("logit_scale", scale)
         if config.text != "clip":
             for part in text_parts(self.clip):
                 part.requires_grad_(False)

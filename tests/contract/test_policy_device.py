@@ -55,7 +55,7 @@ def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_pat
     assert found == pytest.approx(loss, rel=1e-5)
     assert gradients.keys() == others.keys()
     for key, gradient in gradients.items():
-        torch.testing.assert_close(others[key].values, gradient, rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(others[key].values, gradient, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["ranked", "frozen"])

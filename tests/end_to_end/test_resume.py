@@ -11,8 +11,10 @@ from helpers.keyframed import keyframed, training
 from helpers.ranks import in_ranks, lerobot_train
 from safetensors.torch import load_file
 
-STEPS, STOPPED = 6, 3
-"""Eleven rows in batches of two: with one process the sixth step ends an epoch, with two the third does."""
+LENGTHS = (2, 3, 2)
+STEPS, STOPPED = 9, 5
+"""Seven rows in batches of two are four steps of one process, or two of two processes whose last one takes rows from
+the epoch's beginning. Five steps stop both in the middle of a later epoch, nine end both in one after that."""
 
 Train = Callable[[int], Path]
 
@@ -22,7 +24,7 @@ def train(tmp_path_factory: pytest.TempPathFactory) -> Train:
     """Output folder of a training without interruption on so many processes."""
     folder = tmp_path_factory.mktemp("resume")
     settings = training("local/keys", steps=STEPS, save_freq=STOPPED, batch_size=2, seed=5)
-    settings["dataset"]["root"] = str(keyframed(folder / "keys", (3, 5, 3)))
+    settings["dataset"]["root"] = str(keyframed(folder / "keys", LENGTHS))
     settings["policy"]["push_to_hub"] = False
     (folder / "train.yaml").write_text(yaml.safe_dump(settings))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -97,8 +98,20 @@ class _SecondDevice(TorchDispatchMode):
         return found
 
 
+class _FromNumbers(TorchFunctionMode):
+    """Tensors made of Python's numbers, which torch would make on its own meta device, without values."""
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if function is torch.tensor and torch.device(kwargs.get("device") or "cpu") == DEVICE:
+            return torch.tensor(*args, **kwargs | {"device": "cpu"}).to(DEVICE)
+        if function is Tensor.new_tensor and isinstance(args[0], Elsewhere):
+            return torch.tensor(args[1], **{"dtype": args[0].dtype} | kwargs).to(DEVICE)
+        return function(*args, **kwargs)
+
+
 @contextmanager
 def second_device() -> Iterator[list[tuple[int, ...]]]:
     """Inside, ``meta`` is the second device; gives the shapes of all tensors moved back to the CPU so far."""
-    with _SecondDevice() as mode:
+    with _FromNumbers(), _SecondDevice() as mode:
         yield mode.returned
