@@ -1,8 +1,8 @@
 """Puts the frame reader into the datasets that ``lerobot-train`` makes for the policy ``histmv``.
 
 LeRobot has no setting for the dataset class, so its ``make_train_eval_datasets`` is wrapped. The wrapper also refuses
-settings that would silently break training, and gives a resumed training the sampler that goes on in the right epoch; it
-leaves other policies alone.
+settings that would silently break training, and gives a resumed training the sampler that goes on in the right epoch;
+it leaves other policies alone.
 """
 
 import functools
@@ -63,12 +63,14 @@ def install_hook() -> None:
 
 def remove_hook() -> None:
     """Undo ``install_hook``."""
-    wrapper = getattr(factory, FUNCTION)
+    wrapper, sampler = getattr(factory, FUNCTION), getattr(sys.modules.get(HOLDERS[1]), SAMPLER, None)
     if hasattr(wrapper, "__wrapped__"):
         _replace(FUNCTION, wrapper, wrapper.__wrapped__)
+    if isinstance(sampler, functools.partial):
+        _replace(SAMPLER, sampler, EpisodeAwareSampler)
 
 
-def _replace(name: str, old: Callable, new: Callable) -> None:
+def _replace(name: str, old: Any, new: Any) -> None:
     for holder in HOLDERS:
         module = sys.modules.get(holder)
         if module is not None and vars(module).get(name) is old:
@@ -83,9 +85,7 @@ def _wrap(original: Callable) -> Callable:
         checks.check_training(cfg)
         memory.keep_freed_memory()
         if cfg.resume and version("lerobot") in CHECKED_VERSIONS:
-            from lerobot_histmv.data.resume import ResumedSampler  # imports LeRobot's internals, as the reader does
-
-            _replace(SAMPLER, EpisodeAwareSampler, functools.partial(ResumedSampler, batch_size=cfg.batch_size))
+            _resume(cfg.batch_size)
         made = _make(original, cfg)
         for dataset in made:
             if dataset is not None:
@@ -93,6 +93,17 @@ def _wrap(original: Callable) -> Callable:
         return made
 
     return make_train_eval_datasets
+
+
+def _resume(batch_size: int) -> None:
+    """Let the script make our sampler instead of LeRobot's."""
+    from accelerate import PartialState
+
+    from lerobot_histmv.data.resume import ResumedSampler  # imports LeRobot's internals, which other versions may lack
+
+    processes = PartialState().num_processes
+    made = functools.partial(ResumedSampler, batch_size=batch_size, processes=processes)
+    _replace(SAMPLER, EpisodeAwareSampler, made)
 
 
 def _make(original: Callable, cfg: Any) -> Any:

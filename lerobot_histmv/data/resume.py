@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from itertools import chain, islice
 from typing import Any
 
-import torch.distributed
 from lerobot.datasets import EpisodeAwareSampler
 
 
@@ -18,11 +17,13 @@ class ResumedSampler(EpisodeAwareSampler):
 
     Args:
         batch_size: rows per process and step.
+        processes: how many learn together.
     """
 
-    def __init__(self, *args: Any, batch_size: int, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, batch_size: int, processes: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._batch_size = batch_size
+        missing = -len(self) % (batch_size * processes)
+        self._filling = missing if processes > 1 else 0
         self._loaded: int | None = None
         self._ahead = 0
 
@@ -38,11 +39,7 @@ class ResumedSampler(EpisodeAwareSampler):
         super().set_epoch(epoch + self._ahead)
 
     def __iter__(self) -> Iterator[int]:
-        """The rest of the loaded epoch and, on several processes, the rows that fill up its last step; then whole ones."""
+        """The rest of the loaded epoch and, on several processes, what fills up its last step; then whole epochs."""
         epoch, start = self._epoch, self._start_index
         rest = super().__iter__()
-        processes = torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
-        if not start or processes == 1:
-            return rest
-        missing = -len(self) % (self._batch_size * processes)
-        return chain(rest, islice(self._iter_epoch(epoch, 0), missing))
+        return chain(rest, islice(self._iter_epoch(epoch, 0), self._filling)) if start else rest

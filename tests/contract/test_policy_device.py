@@ -1,4 +1,4 @@
-"""The policy works on whatever device it is moved to: nothing is left behind, nothing large comes back, same numbers."""
+"""The policy works on whatever device it is moved to: nothing stays behind, nothing large comes back, same numbers."""
 
 from pathlib import Path
 from typing import Any

@@ -71,9 +71,7 @@ def test_resumed_training_ends_bit_for_bit_as_one_without_interruption(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 1)])
-def test_checkpoints_load_on_another_number_of_processes(
-    train: Train, before: int, after: int, tmp_path: Path
-) -> None:
+def test_checkpoints_load_on_another_number_of_processes(train: Train, before: int, after: int, tmp_path: Path) -> None:
     straight = train(before)
     said = resumed(straight, after, tmp_path)
     assert f"Effective batch size: 2 x {after} = {2 * after}" in said

@@ -1,7 +1,7 @@
 """A second device without hardware: tensors that say they lie on ``meta``, computed on the CPU.
 
-As on a GPU, an operation that mixes them with CPU tensors fails, and what returns to the CPU is seen. Unlike torch's own
-meta tensors they have values, so that code whose shapes depend on values runs to its end.
+As on a GPU, an operation that mixes them with CPU tensors fails, and what returns to the CPU is seen. Unlike torch's
+own meta tensors they have values, so that code whose shapes depend on values runs to its end.
 """
 
 from collections.abc import Iterator

@@ -6,10 +6,10 @@ from typing import Any
 
 import draccus
 import numpy as np
+from helpers.episodes import JOINTS, image_feature, vector_feature, write
 from tiny_policy import CAMERAS
 from tiny_scene import SEEN, cameras_around, tiny_network
 
-from helpers.episodes import JOINTS, image_feature, vector_feature, write
 from lerobot_histmv import keys
 
 SIZE = 32
