@@ -15,6 +15,8 @@ STATE = "observation.state"
 ACTION = "action"
 INTRINSICS = "observation.camera_intrinsics"
 EXTRINSICS = "observation.camera_extrinsics"
+ROW = "index"
+"""Number of a row in its dataset, as LeRobot names it."""
 
 POSITION_NAMES = ("ee.x.pos", "ee.y.pos", "ee.z.pos")
 QUATERNION_NAMES = ("ee.qw.pos", "ee.qx.pos", "ee.qy.pos", "ee.qz.pos")

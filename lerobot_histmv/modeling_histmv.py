@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_histmv import keys
+from lerobot_histmv.chance import drawn_from
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.control import HeldStep
 from lerobot_histmv.data.instructions import load_paraphrases, meanings
@@ -63,6 +64,9 @@ class HistMVPolicy(PreTrainedPolicy):
 
     config_class = HistMVConfig
     name = "histmv"
+    _fsdp_wrap_modules: ClassVar[list[str]] = ["ResidualAttentionBlock", "SelfAttentionBlock"]
+    """Classes that sharded training splits: the layers of a trained CLIP tower and of the history transformer. LeRobot
+    reads them from 0.6.2 on. With frozen towers there is nothing worth sharding, and no layer of the first kind."""
 
     def __init__(self, config: HistMVConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
@@ -117,6 +121,10 @@ class HistMVPolicy(PreTrainedPolicy):
             batch: 2s + 1 rows around each drawn row, as LeRobot's loader and the preprocessor give them.
             reduction: "mean" for a scalar, "none" for one loss per window.
         """
+        with drawn_from(batch.get(keys.ROW) if self.training else None):
+            return self._loss(batch, reduction)
+
+    def _loss(self, batch: Batch, reduction: str) -> tuple[Tensor, dict[str, float]]:
         config = self.config
         window = read_window(batch, config.cameras, self.net.semantics.stored_as)
         sentences = self._paraphrase(batch["task"]) if self.training else batch["task"]

@@ -1,7 +1,8 @@
 """Puts the frame reader into the datasets that ``lerobot-train`` makes for the policy ``histmv``.
 
 LeRobot has no setting for the dataset class, so its ``make_train_eval_datasets`` is wrapped. The wrapper also refuses
-settings that would silently break training; it leaves other policies alone.
+settings that would silently break training, and gives a resumed training the sampler that goes on in the right epoch;
+it leaves other policies alone.
 """
 
 import functools
@@ -13,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lerobot.datasets import LeRobotDataset, factory
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, factory
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from packaging.specifiers import SpecifierSet
 
@@ -23,9 +24,9 @@ logger = logging.getLogger(__name__)
 
 CHECKED_VERSIONS = SpecifierSet(">=0.6.1,<0.7", prereleases=True)
 """LeRobot versions whose reader the frame reader is known to equal."""
-FUNCTION = "make_train_eval_datasets"
+FUNCTION, SAMPLER = "make_train_eval_datasets", "EpisodeAwareSampler"
 HOLDERS = ("lerobot.datasets.factory", "lerobot.scripts.lerobot_train", "__main__")
-"""Modules that may hold the function under its name; the last when the script is run by ``python -m``."""
+"""Modules that may hold them under these names; the last when the script is run by ``python -m``."""
 
 
 def install(dataset: Any) -> bool:
@@ -57,21 +58,23 @@ def install_hook() -> None:
     if original is None or list(inspect.signature(original).parameters) != ["cfg"]:
         logger.warning("LeRobot %s has no %s(cfg): its own, slow reader is used", version("lerobot"), FUNCTION)
     elif not hasattr(original, "__wrapped__"):
-        _replace(original, _wrap(original))
+        _replace(FUNCTION, original, _wrap(original))
 
 
 def remove_hook() -> None:
     """Undo ``install_hook``."""
-    wrapper = getattr(factory, FUNCTION)
+    wrapper, sampler = getattr(factory, FUNCTION), getattr(sys.modules.get(HOLDERS[1]), SAMPLER, None)
     if hasattr(wrapper, "__wrapped__"):
-        _replace(wrapper, wrapper.__wrapped__)
+        _replace(FUNCTION, wrapper, wrapper.__wrapped__)
+    if isinstance(sampler, functools.partial):
+        _replace(SAMPLER, sampler, EpisodeAwareSampler)
 
 
-def _replace(old: Callable, new: Callable) -> None:
-    for name in HOLDERS:
-        module = sys.modules.get(name)
-        if module is not None and vars(module).get(FUNCTION) is old:
-            setattr(module, FUNCTION, new)
+def _replace(name: str, old: Any, new: Any) -> None:
+    for holder in HOLDERS:
+        module = sys.modules.get(holder)
+        if module is not None and vars(module).get(name) is old:
+            setattr(module, name, new)
 
 
 def _wrap(original: Callable) -> Callable:
@@ -81,6 +84,8 @@ def _wrap(original: Callable) -> Callable:
             return original(cfg)
         checks.check_training(cfg)
         memory.keep_freed_memory()
+        if cfg.resume and version("lerobot") in CHECKED_VERSIONS:
+            _resume(cfg.batch_size)
         made = _make(original, cfg)
         for dataset in made:
             if dataset is not None:
@@ -88,6 +93,17 @@ def _wrap(original: Callable) -> Callable:
         return made
 
     return make_train_eval_datasets
+
+
+def _resume(batch_size: int) -> None:
+    """Let the script make our sampler instead of LeRobot's."""
+    from accelerate import PartialState
+
+    from lerobot_histmv.data.resume import ResumedSampler  # imports LeRobot's internals, which other versions may lack
+
+    processes = PartialState().num_processes
+    made = functools.partial(ResumedSampler, batch_size=batch_size, processes=processes)
+    _replace(SAMPLER, EpisodeAwareSampler, made)
 
 
 def _make(original: Callable, cfg: Any) -> Any:

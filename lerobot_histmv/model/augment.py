@@ -6,6 +6,7 @@ import torch
 from einops import einsum, rearrange
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 
 @dataclass(frozen=True)
@@ -88,17 +89,18 @@ def shift_pixels(
     n, k, rows, columns = depth.shape
     most = min(most, rows - 1, columns - 1)
     steps = torch.randint(-most, most + 1, (n, k, 2))
-    new_rgb, new_depth = torch.zeros_like(rgb), torch.zeros_like(depth)
-    for i, j in torch.cartesian_prod(torch.arange(n), torch.arange(k)).tolist():
-        dy, dx = steps[i, j].tolist()
-        y, x = slice(max(dy, 0), rows + min(dy, 0)), slice(max(dx, 0), columns + min(dx, 0))
-        from_y, from_x = slice(max(-dy, 0), rows - max(dy, 0)), slice(max(-dx, 0), columns - max(dx, 0))
-        new_rgb[i, j, :, y, x] = rgb[i, j, :, from_y, from_x]
-        new_depth[i, j, y, x] = depth[i, j, from_y, from_x]
+    top, left = (most - steps).flatten(0, 1).to(depth.device).unbind(-1)
+
+    def shift(maps: Float[Tensor, "n k c y x"]) -> Float[Tensor, "n k c y x"]:
+        """All cut-outs of the padded images are one view of them: picking one of each is a single operation."""
+        padded = functional.pad(rearrange(maps, "n k c y x -> (n k) c y x"), [most] * 4)
+        cut = padded.unfold(2, rows, 1).unfold(3, columns, 1)[torch.arange(n * k, device=maps.device), :, top, left]
+        return rearrange(cut, "(n k) c y x -> n k c y x", n=n)
+
     moved = intrinsics.clone()
     moved[..., 2] += steps[..., 1].to(intrinsics)
     moved[..., 3] += steps[..., 0].to(intrinsics)
-    return new_rgb, new_depth, moved
+    return shift(rgb), shift(depth[:, :, None])[:, :, 0], moved
 
 
 def jitter_colours(rgb: Float[Tensor, "n k 3 y x"], config: AugmentConfig) -> Float[Tensor, "n k 3 y x"]:

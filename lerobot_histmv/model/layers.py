@@ -1,5 +1,7 @@
 """Shared blocks of the network; knows nothing of robots, cameras or steps."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -67,9 +69,9 @@ class Modulation(nn.Module):
         return maps * (1 + self.gain(text)[:, :, None, None]) + self.bias(text)[:, :, None, None]
 
 
-def full_precision(like: Tensor) -> torch.autocast:
+def full_precision(like: Tensor) -> AbstractContextManager:
     """Context for geometry and information inside mixed precision: half precision would round metres to millimetres."""
-    return torch.autocast(like.device.type, enabled=False)
+    return nullcontext() if like.is_meta else torch.autocast(like.device.type, enabled=False)
 
 
 def masked_mean(values: Float[Tensor, "*s"], weights: Float[Tensor, "*s"]) -> Float[Tensor, ""]:

@@ -80,7 +80,10 @@ class ClipTowers(ImageTower):
         self.clip = clip
         self.trained = config.trained
         self.clip.requires_grad_(self.trained)
-        self.clip.logit_scale.requires_grad_(False)  # only a contrastive loss would use it
+        # Only a contrastive loss would train it, and sharded training refuses parameters that are single numbers.
+        scale = self.clip.logit_scale.detach()
+        del self.clip.logit_scale
+        self.clip.register_buffer("logit_scale", scale)
         if config.image != "clip":
             del self.clip.visual
         if config.text != "clip":

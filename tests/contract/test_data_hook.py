@@ -9,13 +9,14 @@ import draccus
 import keyframed_dataset as sample
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import factory
+from lerobot.datasets import EpisodeAwareSampler, factory
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
 
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data import hook
 from lerobot_histmv.data.reader import FrameReader
+from lerobot_histmv.data.resume import ResumedSampler
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,17 @@ def test_held_out_episodes_get_it_too(root: Path) -> None:
     assert len(training) + len(held_out) == sum(sample.LENGTHS)
     for dataset in (training, held_out):
         assert len(list(dataset)) == len(dataset)
+
+
+def test_a_resumed_training_gets_the_sampler_that_goes_on_and_others_keep_lerobots(root: Path) -> None:
+    config = configured(root)
+    lerobot_train.make_train_eval_datasets(config)
+    assert lerobot_train.EpisodeAwareSampler is EpisodeAwareSampler
+    config.resume = True
+    lerobot_train.make_train_eval_datasets(config)
+    assert isinstance(lerobot_train.EpisodeAwareSampler([0], [7]), ResumedSampler)
+    hook.remove_hook()
+    assert lerobot_train.EpisodeAwareSampler is EpisodeAwareSampler
 
 
 def test_other_policies_are_left_alone(root: Path) -> None:

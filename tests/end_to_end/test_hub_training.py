@@ -4,46 +4,15 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-import draccus
-import numpy as np
 import pytest
 import yaml
-from helpers.episodes import JOINTS, image_feature, vector_feature, write
 from helpers.hub_client import environment
 from helpers.hub_server import Hub, serve
+from helpers.keyframed import SIZE, keyframed, training
 from huggingface_hub import ModelCard
-from tiny_policy import CAMERAS
-from tiny_scene import SEEN, cameras_around, tiny_network
 
-from lerobot_histmv import keys
-
-SIZE = 32
 STEPS = 2
-
-
-def keyframed(root: Path) -> Path:
-    """Two episodes of two rows, noise in the size that the environment is asked for."""
-    features: dict[str, Any] = {
-        keys.STATE: vector_feature((*keys.POSE_NAMES, *JOINTS)),
-        keys.ACTION: vector_feature(keys.POSE_NAMES),
-        keys.INTRINSICS: vector_feature(keys.intrinsics_names(CAMERAS)),
-        keys.EXTRINSICS: vector_feature(keys.extrinsics_names(CAMERAS)),
-    }
-    for camera in CAMERAS:
-        features[keys.rgb_key(camera)] = image_feature(3, size=(SIZE, SIZE))
-        depth = {**image_feature(1, size=(SIZE, SIZE)), "info": {"is_depth_map": True}}
-        features[keys.depth_key(camera)] = depth
-    chance = np.random.default_rng(0)
-    intrinsics, extrinsics = (values.numpy().ravel() for values in cameras_around(len(CAMERAS)))
-    pose = np.float32([*SEEN, 1, 0, 0, 0, 1])
-    frame: dict[str, Any] = {keys.STATE: np.append(pose, np.zeros(6, np.float32)), keys.ACTION: pose}
-    frame |= {keys.INTRINSICS: intrinsics, keys.EXTRINSICS: extrinsics}
-    for camera in CAMERAS:
-        frame[keys.rgb_key(camera)] = chance.integers(256, size=(SIZE, SIZE, 3), dtype=np.uint8)
-        frame[keys.depth_key(camera)] = chance.integers(300, 700, size=(SIZE, SIZE, 1), dtype=np.uint16)
-    return write(root, [[frame] * 2] * 2, features)
 
 
 def command(hub: Hub, home: Path, name: str, *words: str) -> str:
@@ -60,16 +29,7 @@ def test_train_on_pulled_data_push_the_policy_and_evaluate_it_by_name(tmp_path: 
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     for folder in (here, elsewhere):
         folder.mkdir()
-    settings = {
-        "policy": {"type": "histmv", "device": "cpu", "network": draccus.encode(tiny_network())},
-        "dataset": {"repo_id": "ann/keys", "depth_output_unit": "mm", "use_imagenet_stats": False},
-        "steps": STEPS,
-        "save_freq": STEPS,
-        "batch_size": 2,
-        "num_workers": 0,
-        "env_eval_freq": 0,
-        "log_freq": 1,
-    }
+    settings = training("ann/keys", steps=STEPS, save_freq=STEPS, batch_size=2)
     (here / "train.yaml").write_text(yaml.safe_dump(settings))
     with serve(ann="token-of-ann") as hub:
         command(hub, here, "histmv", "push", f"--root={keyframed(tmp_path / 'keys')}", "--repo_id=ann/keys")

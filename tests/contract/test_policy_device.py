@@ -1,0 +1,99 @@
+"""The policy works on whatever device it is moved to: nothing stays behind, nothing large comes back, same numbers."""
+
+from pathlib import Path
+from typing import Any
+
+import open_clip
+import pytest
+import torch
+from helpers.elsewhere import DEVICE, Elsewhere, second_device
+from tiny_policy import episode, observation, stack, tiny_config, tiny_policy, window
+from tiny_scene import tiny_network
+
+from lerobot_histmv.chance import drawn_from
+from lerobot_histmv.model import semantics
+from lerobot_histmv.model.augment import AugmentConfig
+from lerobot_histmv.model.config import NetworkConfig, SemanticsConfig, ViewConfig
+from lerobot_histmv.modeling_histmv import HistMVPolicy
+
+
+def networks(folder: Path) -> dict[str, NetworkConfig]:
+    """Every way to choose views, and frozen towers, which lie outside of the policy's module tree."""
+    weights = folder / "clip.pt"
+    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
+    return {
+        "ranked": tiny_network(),
+        "sampled": tiny_network(views=ViewConfig(train_choice="sampled")),
+        "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
+    }
+
+
+def moved(batch: dict[str, Any]) -> dict[str, Any]:
+    """The batch as LeRobot's device step hands it over."""
+    return {key: value.to(DEVICE) if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
+
+
+def train(policy: HistMVPolicy, batch: dict[str, Any]) -> tuple[float, dict[str, torch.Tensor]]:
+    """Loss and gradients of one step with augmentation."""
+    torch.manual_seed(3)
+    loss, _ = policy.train()(batch)
+    loss.backward()
+    return loss.item(), {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize("name", ["ranked", "sampled", "frozen"])
+def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_path: Path) -> None:
+    config = tiny_config(network=networks(tmp_path)[name], augment=AugmentConfig(depth_noise=0.01))
+    batch = stack([window(episode(5), 4), window(episode(5), 1), window(episode(1), 0)]) | {"index": torch.arange(3)}
+    loss, gradients = train(tiny_policy(config), batch)
+    policy = tiny_policy(config)
+    with second_device() as returned:
+        policy.to(DEVICE)
+        assert all(isinstance(parameter, Elsewhere) for parameter in policy.parameters())
+        found, others = train(policy, moved(batch))
+        assert max(len(shape) and shape[0] for shape in returned) <= len(batch["index"]), returned
+    assert found == pytest.approx(loss, rel=1e-5)
+    assert gradients.keys() == others.keys()
+    for key, gradient in gradients.items():
+        torch.testing.assert_close(others[key].values, gradient, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["ranked", "frozen"])
+def test_acting_elsewhere_gives_the_same_actions(name: str, tmp_path: Path) -> None:
+    config, rows = tiny_config(network=networks(tmp_path)[name]), episode(3)
+    here = tiny_policy(config)
+    expected = [here.select_action(observation(rows, step)) for step in range(3)]
+    policy = tiny_policy(config)
+    with second_device() as returned:
+        policy.to(DEVICE)
+        for step in range(3):
+            action = policy.select_action(moved(observation(rows, step)))
+            assert isinstance(action, Elsewhere)
+            torch.testing.assert_close(action.values, expected[step])
+    assert not returned
+
+
+def test_second_device_refuses_what_a_gpu_refuses() -> None:
+    with second_device() as returned:
+        there = torch.arange(3, device=DEVICE)
+        with pytest.raises(RuntimeError, match="two devices"):
+            there + torch.arange(3)
+        assert (there + 1)[torch.tensor([2])].tolist() == [3]
+    assert returned == [(1,)]
+
+
+def test_random_numbers_follow_from_the_rows_and_leave_no_trace() -> None:
+    def draw(*rows: int) -> float:
+        with drawn_from(torch.tensor(rows)):
+            return torch.rand(()).item()
+
+    torch.manual_seed(5)
+    expected = torch.rand(2).tolist()
+    torch.manual_seed(5)
+    first, found = draw(7, 11), torch.rand(()).item()
+    assert [found, torch.rand(()).item()] == expected
+    assert draw(7, 11) == first
+    assert len({first, draw(11, 7), draw(7, 13), draw(7), *expected}) == 6
+    with drawn_from(None):
+        torch.manual_seed(5)
+    assert torch.rand(2).tolist() == expected

@@ -1,0 +1,81 @@
+"""Half precision, another memory layout and a compiler change how the policy computes, not what."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers.ranks import in_ranks
+from tiny_policy import episode, observation, stack, tiny_policy, window
+
+from lerobot_histmv.modeling_histmv import HistMVPolicy
+
+
+def step(policy: HistMVPolicy) -> tuple[torch.Tensor, torch.Tensor]:
+    """Loss and all gradients, in one vector, of a training step."""
+    batch = stack([window(episode(5), 4), window(episode(5), 1), window(episode(1), 0)])
+    torch.manual_seed(3)
+    loss, _ = policy.train()(batch)
+    loss.backward()
+    return loss, torch.cat([p.grad.flatten() for p in policy.parameters() if p.grad is not None])
+
+
+def actions(policy: HistMVPolicy) -> torch.Tensor:
+    rows = episode(3)
+    return torch.cat([policy.select_action(observation(rows, at)) for at in range(3)])
+
+
+def test_bfloat16_keeps_the_loss_and_the_direction_of_the_gradient() -> None:
+    expected, gradient = step(tiny_policy())
+    with torch.autocast("cpu", torch.bfloat16):
+        loss, found = step(tiny_policy())
+    assert loss.dtype == found.dtype == torch.float32
+    torch.testing.assert_close(loss, expected, rtol=0.02, atol=0)
+    assert 0.9 < torch.cosine_similarity(found, gradient, dim=0) < 1 - 1e-6, "1 would mean that nothing was rounded"
+
+
+def test_bfloat16_leaves_geometry_alone() -> None:
+    """Half precision would round a metre to four millimetres."""
+    policy = tiny_policy()
+    seen: list[torch.Tensor] = []
+    encode: Callable[..., Any] = policy.net.encode
+
+    def listen(observed: Any) -> Any:
+        encoding = encode(observed)
+        seen.append(encoding.cloud)
+        return encoding
+
+    policy.net.encode = listen  # type: ignore[method-assign]
+    actions(policy)
+    policy.reset()
+    with torch.autocast("cpu", torch.bfloat16):
+        acted = actions(policy)
+    assert all(plain.equal(half) for plain, half in zip(seen[:3], seen[3:], strict=True))
+    assert acted.dtype == torch.float32
+    torch.testing.assert_close(acted[:, 3:7].norm(dim=-1), torch.ones(3))
+
+
+def test_channels_last_weights_give_the_same_loss_and_gradients() -> None:
+    expected, gradient = step(tiny_policy())
+    loss, found = step(tiny_policy().to(memory_format=torch.channels_last))  # type: ignore[call-overload]
+    torch.testing.assert_close(loss, expected)
+    torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5)
+
+
+def compiled(_: int, loaded: Path) -> None:
+    """Traced and differentiated by the compiler, without its code generator, which would take minutes."""
+    policy = tiny_policy()
+    policy.net.rgba.compile(backend="aot_eager", fullgraph=True)
+    policy.net.history.compile(backend="aot_eager", fullgraph=True)
+    torch.save(step(policy), loaded)
+
+
+@pytest.mark.slow
+def test_compiled_parts_give_the_same_loss_and_gradients(tmp_path: Path) -> None:
+    """In a process of its own: the compiler cannot trace the checks of array shapes that tests run with."""
+    in_ranks(1, tmp_path / "log", compiled, tmp_path / "step.pt")
+    expected, gradient = step(tiny_policy())
+    loss, found = torch.load(tmp_path / "step.pt")
+    torch.testing.assert_close(loss, expected)
+    torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-4)

@@ -1,0 +1,78 @@
+"""``lerobot-train`` goes on where it was stopped, on one process and on two, and from either with the other."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from helpers.keyframed import keyframed, training
+from helpers.ranks import in_ranks, lerobot_train
+from safetensors.torch import load_file
+
+LENGTHS = (2, 3, 2)
+STEPS, STOPPED = 9, 5
+"""Seven rows in batches of two are four steps of one process, or two of two processes whose last one takes rows from
+the epoch's beginning. Five steps stop both in the middle of a later epoch, nine end both in one after that."""
+
+Train = Callable[[int], Path]
+
+
+@pytest.fixture(scope="module")
+def train(tmp_path_factory: pytest.TempPathFactory) -> Train:
+    """Output folder of a training without interruption on so many processes."""
+    folder = tmp_path_factory.mktemp("resume")
+    settings = training("local/keys", steps=STEPS, save_freq=STOPPED, batch_size=2, seed=5)
+    settings["dataset"]["root"] = str(keyframed(folder / "keys", LENGTHS))
+    settings["policy"]["push_to_hub"] = False
+    (folder / "train.yaml").write_text(yaml.safe_dump(settings))
+
+    def run(processes: int) -> Path:
+        output = folder / f"straight_{processes}"
+        if not output.is_dir():
+            words = [f"--config_path={folder}/train.yaml", f"--output_dir={output}"]
+            in_ranks(processes, folder / f"straight_{processes}.log", lerobot_train, words)
+        return output
+
+    return run
+
+
+def resumed(straight: Path, processes: int, output: Path) -> str:
+    """Goes on from the earlier checkpoint of ``straight`` in new processes; what they log."""
+    first = straight / f"checkpoints/{STOPPED:06d}"
+    shutil.copytree(first, output / "checkpoints" / first.name)
+    (output / "checkpoints/last").symlink_to(first.name)
+    config = output / "checkpoints/last/pretrained_model/train_config.json"
+    log = output / "log.txt"
+    words = [f"--config_path={config}", "--resume=true", f"--output_dir={output}"]
+    in_ranks(processes, log, lerobot_train, words)
+    return log.read_text()
+
+
+def state(output: Path) -> dict[str, torch.Tensor]:
+    """Weights, and the optimizer's averages, at the end."""
+    last = output / f"checkpoints/{STEPS:06d}"
+    files = ("pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors")
+    return {f"{file}: {name}": value for file in files for name, value in load_file(last / file).items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [1, 2])
+def test_resumed_training_ends_bit_for_bit_as_one_without_interruption(
+    train: Train, processes: int, tmp_path: Path
+) -> None:
+    straight = train(processes)
+    resumed(straight, processes, tmp_path)
+    expected, found = state(straight), state(tmp_path)
+    assert expected.keys() == found.keys()
+    assert [name for name, value in expected.items() if not value.equal(found[name])] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 1)])
+def test_checkpoints_load_on_another_number_of_processes(train: Train, before: int, after: int, tmp_path: Path) -> None:
+    straight = train(before)
+    said = resumed(straight, after, tmp_path)
+    assert f"Effective batch size: 2 x {after} = {2 * after}" in said
+    assert state(tmp_path).keys() == state(straight).keys()

@@ -1,0 +1,57 @@
+"""Runs a function in fresh processes, alone or as the ranks of one process group, without importing LeRobot anew."""
+
+import logging
+import multiprocessing
+import os
+import socket
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+PRELOADED = ["lerobot.scripts.lerobot_train", "lerobot_histmv.modeling_histmv"]
+"""Imported once by the server that every process is forked from: these imports take longer than all the rest."""
+
+
+def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: Any) -> None:
+    """``function(rank, *arguments)`` in ``count`` processes that find each other as torchrun's would.
+
+    ``log`` gets what they print. AssertionError with that, if one fails.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes = [
+        context.Process(target=_run, args=(rank, count, port, log, function, arguments)) for rank in range(count)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert all(process.exitcode == 0 for process in processes), log.read_text()
+
+
+def _run(rank: int, count: int, port: int, log: Path, function: Callable[..., None], arguments: Sequence[Any]) -> None:
+    if count > 1:
+        names = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count, "MASTER_PORT": port}
+        os.environ |= {name: str(value) for name, value in names.items()} | {"MASTER_ADDR": "127.0.0.1"}
+    with log.open("a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        try:
+            function(rank, *arguments)
+        except BaseException:
+            traceback.print_exc()
+            logging.shutdown()
+            os._exit(1)
+
+
+def lerobot_train(_: int, words: Sequence[str]) -> None:
+    """The command ``lerobot-train`` with these words."""
+    from lerobot.scripts.lerobot_train import main
+
+    sys.argv = ["lerobot-train", *words]
+    main()
