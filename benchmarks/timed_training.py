@@ -24,7 +24,7 @@ PLAN, CLOCK, STOPPED = "plan.json", "clock.json", "stopped"
 SAVE_MINUTES = 5
 """At most so much training is lost when it is killed."""
 PROBE_STEPS, PROBE_WARM_UP, PROBE_LEAST, PROBE_SECONDS = 10**6, 3, 5, 60.0
-"""Steps that the probe pretends to train, steps before the timed ones, fewest timed ones, and how long they are timed."""
+"""Steps that the probe pretends to train, steps before the timed ones, fewest timed ones, seconds of timing."""
 OVERRUN = 1.1
 """Share of the budget after which a training that turned out slower than the probe is stopped."""
 
