@@ -5,7 +5,8 @@
 
 Every method trains with ``lerobot-train`` for the same wall-clock minutes on the same machine, one after another, and
 is evaluated with ``histmv eval`` on the same 100 scenes. ``METHODS`` tells what each sees and learns from. ACT and
-Diffusion Policy take no instruction: give them settings with one variation. Killed and started again, it continues.
+Diffusion Policy take no instruction: give them settings with one variation. Diffusion Policy needs
+``pip install 'lerobot[diffusion]'``. Killed and started again, it continues.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import os
 import shutil
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +34,9 @@ FIGURE = Path(__file__).parents[1] / "docs" / "images" / "peers.png"
 OUTPUT = Path("outputs/peers")
 NOT_FOR_PEERS = [*map(keys.depth_key, CAMERA_NAMES), keys.INTRINSICS, keys.EXTRINSICS]
 """LeRobot's policies take every image for a colour camera and know no calibration."""
-RGB_D = "RGB, depth and calibration of three cameras, measured tool poses, instruction"
-RGB = "RGB of three cameras, measured tool pose and joints"
-DENSE, MACRO = "every frame, 20 Hz", "keyframes, one decision per macro step"
+RGB_D = "three RGB-D cameras, calibration, tool poses, instruction"
+RGB = "three RGB cameras, tool pose, joints"
+DENSE, MACRO = "every frame at 20 Hz", "keyframes, a decision per macro step"
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,12 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--figure", type=Path, default=FIGURE)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    return parser.parse_args()
+    args = parser.parse_args()
+    if min(args.minutes) < 1:
+        parser.error(f"--minutes {args.minutes}: give whole minutes, at least 1")
+    if "diffusion" in args.methods and find_spec("diffusers") is None:
+        parser.error("Diffusion Policy needs diffusers: pip install 'lerobot[diffusion]', or choose other --methods")
+    return args
 
 
 def main() -> None:

@@ -98,7 +98,7 @@ class Clock:
         due = step - step % self._plan.save_freq
         if due > self._first and due not in self.reached:
             self.reached[due] = seconds
-            write_json(self._file, self.reached)
+            write_json(self._file, {str(step): seconds for step, seconds in self.reached.items()})
         if seconds > self._plan.seconds() and step < self._plan.steps:
             raise EnoughError
 
