@@ -36,7 +36,7 @@ NOT_FOR_PEERS = [*map(keys.depth_key, CAMERA_NAMES), keys.INTRINSICS, keys.EXTRI
 """LeRobot's policies take every image for a colour camera and know no calibration."""
 RGB_D = "three RGB-D cameras, calibration, tool poses, instruction"
 RGB = "three RGB cameras, tool pose, joints"
-DENSE, MACRO = "every frame at 20 Hz", "keyframes, a decision per macro step"
+DENSE, MACRO = "every frame at 20 Hz, as video", "keyframes, a decision per macro step"
 
 
 @dataclass(frozen=True)
@@ -63,26 +63,45 @@ class Method:
 METHODS = {
     "histmv": Method("HistMV", "train/default", "keyframes", "macro", RGB_D, MACRO),
     "hiveformer": Method("Hiveformer-style", "train/hiveformer", "keyframes", "macro", RGB_D, MACRO),
-    "act": Method("ACT", "peers/act", "episodes_rgb", "servo", RGB, DENSE),
+    "act": Method("ACT", "peers/act", "episodes_video", "servo", RGB, DENSE),
     "act_keyframes": Method("ACT on keyframes", "peers/act_keyframes", "keyframes_rgb", "macro", RGB, MACRO),
-    "diffusion": Method("Diffusion Policy", "peers/diffusion", "episodes_rgb", "servo", RGB, DENSE),
+    "diffusion": Method("Diffusion Policy", "peers/diffusion", "episodes_video", "servo", RGB, DENSE),
 }
 
 
-def colour_stage(setting: str, dataset: str, folder: Path) -> Stage:
-    """Copy a dataset without what LeRobot's policies do not take."""
-    output = folder / f"{dataset}_rgb"
+def edit_stage(folder: Path, old: str, new: str, title: str, *operation: str) -> Stage:
+    """Copy a dataset with ``lerobot-edit-dataset``; it does not write into what a killed one has left."""
     command = (
-        "lerobot-edit-dataset", f"--repo_id=local/{dataset}", f"--root={folder / dataset}",
-        f"--new_repo_id=local/{dataset}_rgb", f"--new_root={output}",
-        "--operation.type=remove_feature", f"--operation.feature_names={json.dumps(NOT_FOR_PEERS)}",
+        "lerobot-edit-dataset", f"--repo_id=local/{old}", f"--root={folder / old}",
+        f"--new_repo_id=local/{new}", f"--new_root={folder / new}", *operation,
     )  # fmt: skip
 
     def again() -> Command:
-        shutil.rmtree(output, ignore_errors=True)
+        shutil.rmtree(folder / new, ignore_errors=True)
         return command
 
-    return Stage(f"{dataset}_rgb", f"leave out depth and calibration of {setting}'s {dataset}", command, again)
+    return Stage(new, title, command, again)
+
+
+def colour_stage(folder: Path, dataset: str) -> Stage:
+    """Copy a dataset without what LeRobot's policies do not take."""
+    names = f"--operation.feature_names={json.dumps(NOT_FOR_PEERS)}"
+    title = f"copy the {dataset} without depth and calibration"
+    return edit_stage(folder, dataset, f"{dataset}_rgb", title, "--operation.type=remove_feature", names)
+
+
+def video_stages(folder: Path) -> list[Stage]:
+    """Copy the dense episodes' colour images to videos, the form in which LeRobot records.
+
+    For images LeRobot decodes those of every action of a chunk: 0.13 s of CPU time per sample for 40 actions, 0.025 s
+    with videos. The conversion leaves out the images' statistics, which training wants.
+    """
+    operation = ("--operation.type=convert_image_to_video", "--operation.num_workers=2")
+    stats = [str(folder / name / "meta" / "stats.json") for name in ("episodes_rgb", "episodes_video")]
+    return [
+        edit_stage(folder, "episodes_rgb", "episodes_video", "make videos of them", *operation),
+        Stage("episodes_stats", "copy the images' statistics", ("cp", *stats)),
+    ]
 
 
 def training_command(method: Method, folder: Path, seed: int) -> Command:
@@ -136,11 +155,9 @@ def prepare(args: argparse.Namespace, environment: dict[str, str]) -> None:
     """Record, keyframe and make the copies that the chosen methods need."""
     folder = args.output / args.setting
     needed = {METHODS[name].dataset for name in args.methods}
-    copies = [
-        colour_stage(args.setting, dataset, folder)
-        for dataset in ("episodes", "keyframes")
-        if f"{dataset}_rgb" in needed
-    ]
+    copies = [colour_stage(folder, "keyframes")] if "keyframes_rgb" in needed else []
+    if "episodes_video" in needed:
+        copies += [colour_stage(folder, "episodes"), *video_stages(folder)]
     run_stages([*data_stages(args.setting, folder), *copies], folder, Console(), environment)
 
 

@@ -1,8 +1,8 @@
 """``lerobot-train`` on a budget of wall-clock minutes: steps that fit, and checkpoints at given minutes.
 
 A step is timed first, because learning rate schedules span the whole run. Then the planned steps are trained, with a
-checkpoint at every asked minute. The clock runs from the first drawing of LeRobot's progress bar: reading data,
-computing and writing checkpoints count, starting Python does not. Killed and called again, training goes on from its
+checkpoint at every asked minute. The clock counts reading data, computing and writing checkpoints; it does not count the
+time until the first step, in which Python and the data loader start. Killed and called again, training goes on from its
 last checkpoint, with the clock as it was there.
 """
 
@@ -89,10 +89,11 @@ class Clock:
         Raises:
             EnoughError: the budget is used up.
         """
-        if total != self._plan.steps - self._first:
-            return  # another progress bar
+        if total != self._plan.steps - self._first or done == 0:
+            return  # another progress bar, or the data loader's process is starting
         now = self._now()
-        self._start = now if self._start is None else self._start
+        if self._start is None:
+            self._start = now - done * self._plan.seconds_per_step
         seconds = self._before + now - self._start
         step = self._first + done
         due = step - step % self._plan.save_freq

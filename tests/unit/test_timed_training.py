@@ -55,36 +55,37 @@ def test_the_clock_goes_on_where_the_last_checkpoint_was(timed: ModuleType, tmp_
     first = timed.Clock(tmp_path, plan, 0, now)
     first.tick(3, 17)
     now.seconds += 300
-    first.tick(0, 24)  # only now training starts
+    first.tick(0, 24)
+    now.seconds += 100  # another bar and starting are no training: the first step counts as it was measured
     for step in range(1, 20):
-        now.seconds += 6
         first.tick(step, 24)
-    assert first.reached == {12: 72.0}
+        now.seconds += 6
+    assert first.reached == {12: 5.0 + 11 * 6}
     # Killed after step 19: what came after the checkpoint at 12 was for nothing.
     now.seconds += 9999
     second = timed.Clock(tmp_path, plan, 12, now)
     for done in range(13):
         second.tick(done, 12)
         now.seconds += 4
-    assert second.reached == {12: 72.0, 24: 72.0 + 12 * 4}
-    assert json.loads((tmp_path / timed.CLOCK).read_text()) == {"12": 72.0, "24": 120.0}
+    assert second.reached == {12: 71.0, 24: 71.0 + 5.0 + 11 * 4}
+    assert json.loads((tmp_path / timed.CLOCK).read_text()) == {"12": 71.0, "24": 120.0}
 
 
 def test_times_of_checkpoints_that_were_never_written_are_forgotten(timed: ModuleType, tmp_path: Path) -> None:
     plan, now = timed.Plan.of((1, 2), 5.0), Watch()
     lost = timed.Clock(tmp_path, plan, 0, now)
-    lost.tick(0, 24)
+    lost.tick(1, 24)
     now.seconds += 50
     lost.tick(13, 24)  # a bar that jumps still finds the checkpoint at 12
-    assert lost.reached == {12: 50.0}
+    assert lost.reached == {12: 55.0}
     assert timed.Clock(tmp_path, plan, 0, now).reached == {}
 
 
 def test_a_training_slower_than_planned_is_stopped(timed: ModuleType, tmp_path: Path) -> None:
     plan, now = timed.Plan.of((1, 2), 5.0), Watch()
     clock = timed.Clock(tmp_path, plan, 0, now)
-    clock.tick(0, 24)
-    now.seconds += plan.seconds() - 1
+    clock.tick(1, 24)
+    now.seconds += plan.seconds() - plan.seconds_per_step - 1
     clock.tick(11, 24)
     now.seconds += 2
     with pytest.raises(timed.EnoughError):
