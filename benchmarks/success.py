@@ -26,6 +26,7 @@ RESULTS = Path(__file__).parent / "results" / "success.json"
 SETTINGS: dict[str, tuple[str, int]] = {
     "reach_target": ("reach_target", 50),
     "pick_and_lift": ("pick_and_lift", 50),
+    "pick_and_lift_fixed": ("pick_and_lift.red", 50),
     "push_buttons_fixed": ("push_buttons.red-green", 50),
     "push_buttons": ("push_buttons", 100),
     "turn_tap": ("turn_tap.left", 50),
@@ -73,17 +74,17 @@ def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
     ]
 
 
-def anywhere(command: str, output: Path) -> str:
+def anywhere(command: str, output: Path, default: Path = OUTPUT) -> str:
     """The command as one would type it in a checkout, with the default output folder."""
-    return command.replace(f"{config_files.folder().parent}/", "").replace(str(output), str(OUTPUT))
+    return command.replace(f"{config_files.folder().parent}/", "").replace(str(output), str(default))
 
 
-def add_result(name: str, result: dict[str, Any]) -> None:
+def add_result(name: str, result: dict[str, Any], file: Path = RESULTS) -> None:
     """Put one result among the others; several benchmarks may do so at once."""
-    RESULTS.parent.mkdir(exist_ok=True)
-    with FileLock(RESULTS.parent / ".lock"):
-        known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-        write_json(RESULTS, dict(sorted((known | {name: result}).items())))
+    file.parent.mkdir(exist_ok=True)
+    with FileLock(file.parent / ".lock"):
+        known = json.loads(file.read_text()) if file.is_file() else {}
+        write_json(file, dict(sorted((known | {name: result}).items())))
 
 
 def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict[str, str]) -> None:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 ESCAPES = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 COUNT = re.compile(r"(?<![\d.])(\d+)/(\d+)(?![\d.])")
-TQDM_BAR = re.compile(r"^.*?\d+/\d+ \[[^\]]*\](?=.)")
-"""A progress bar with other text after it: on a terminal the next drawing would have covered the bar."""
+TQDM_BAR = re.compile(r"^.*?\d+/\d+ \[[^\]]*\]")
+"""A progress bar. Text may follow on the same line: on a terminal the next drawing would have covered the bar."""
 
 PLAIN_TERMINAL = {"TERM": "xterm", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
 ROWS, COLUMNS = 40, 120
@@ -48,10 +48,12 @@ class Child:
         """
         with log.open("a") as file:
             for text, finished in terminal_lines(self.output):
+                bar = TQDM_BAR.match(text)
+                shown = bar.group() if bar else "" if finished else text
                 if finished:
-                    file.write(TQDM_BAR.sub("", text) + "\n")
+                    file.write((text.removeprefix(shown) or text) + "\n")
                     file.flush()
-                elif counts := COUNT.findall(text):
+                if counts := COUNT.findall(shown):
                     done, total = map(int, counts[-1])
                     if done <= total:
                         report(done, total)

@@ -101,8 +101,27 @@ def run_stages(stages: Sequence[Stage], folder: Path, console: Console, environm
             write_state(folder, state)
 
 
-def run_stage(title: str, command: Command, log: Path, console: Console, environment: Mapping[str, str]) -> float:
-    """Run one command with a progress line; returns the seconds it took."""
+def run_stage(
+    title: str,
+    command: Command,
+    log: Path,
+    console: Console,
+    environment: Mapping[str, str],
+    watch: Callable[[int, int], None] = lambda done, total: None,
+) -> float:
+    """Run one command with a progress line; returns the seconds it took.
+
+    Args:
+        title: what the user reads.
+        command: console script and arguments.
+        log: gets the command's output.
+        console: shows the progress.
+        environment: variables added to this process's own.
+        watch: told (done, total) each time the command's progress bar moves; what it raises stops the command.
+
+    Raises:
+        StageFailedError: the command failed; the message ends with the last lines of its log.
+    """
     start = time.monotonic()
     if not console.is_terminal:
         say(console, f"{title} ...")
@@ -111,7 +130,12 @@ def run_stage(title: str, command: Command, log: Path, console: Console, environ
     # The child is started before the progress display, whose thread must not be forked.
     with child_process.start(command, environment) as child, display as bar:
         task = bar.add_task(title, total=None)
-        status = child.follow(log, lambda done, total: bar.update(task, completed=done, total=total))
+
+        def report(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+            watch(done, total)
+
+        status = child.follow(log, report)
     if status != 0:
         tail = "\n".join(f"  | {line}" for line in log.read_text().splitlines()[-TAIL:])
         raise StageFailedError(

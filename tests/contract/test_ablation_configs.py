@@ -75,8 +75,7 @@ def test_one_training_step_teaches_every_weight_and_acting_equals_the_whole_wind
     loss, log = policy.train()(stack([window(rows, end, LONG - 1) for end in (1, 4)]))
     loss.backward()
     assert all(math.isfinite(value) for value in log.values())
-    idle = [name for name, p in policy.named_parameters() if p.grad is None]
-    assert [name for name in idle] == []
+    assert [name for name, p in policy.named_parameters() if p.grad is None] == []
     assert ("mutual_information" in log) == (policy.config.network.views.fusion == "attention")
     policy.config.get_optimizer_preset().build(policy.get_optim_params()).step()
     assert all(parameter.isfinite().all() for parameter in policy.parameters())

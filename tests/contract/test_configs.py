@@ -10,6 +10,7 @@ import lerobot_policy_histmv  # noqa: F401
 from dataset_tools import config_files
 
 TRAIN = [name for name in config_files.names() if name.startswith(("train/", "ablation/"))]
+PEERS = {"peers/act": "act", "peers/act_keyframes": "act", "peers/diffusion": "diffusion"}
 
 
 def load(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> TrainPipelineConfig:
@@ -25,7 +26,7 @@ def load(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> TrainP
 
 def test_every_yaml_file_is_covered_here() -> None:
     assert {"train/default", "train/demo", "train/paper"} <= set(TRAIN)
-    assert config_files.names() == TRAIN, "a new kind of config needs a test that loads it"
+    assert set(config_files.names()) == {*TRAIN, *PEERS}, "a new kind of config needs a test that loads it"
 
 
 @pytest.mark.parametrize("name", TRAIN)
@@ -38,6 +39,22 @@ def test_lerobot_train_accepts_the_file(name: str, monkeypatch: pytest.MonkeyPat
     assert cfg.dataset.repo_id == "a/b"
     assert cfg.dataset.depth_output_unit == "mm"
     assert not cfg.dataset.image_transforms.enable, "LeRobot's transforms move colour but not depth"
+
+
+@pytest.mark.parametrize(("name", "policy"), PEERS.items())
+def test_lerobot_train_accepts_the_peers_without_downloads(
+    name: str, policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    cfg = load(config_files.find(name), monkeypatch, f"--output_dir={tmp_path / 'new'}")
+    cfg.validate()
+    assert cfg.policy is not None
+    assert cfg.policy.type == policy
+    assert cfg.policy.pretrained_backbone_weights is None
+    assert not cfg.policy.push_to_hub
+    if policy == "diffusion":
+        assert (
+            cfg.policy.drop_n_last_frames == cfg.policy.horizon - cfg.policy.n_action_steps - cfg.policy.n_obs_steps + 1
+        )
 
 
 def test_the_command_line_wins_over_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
