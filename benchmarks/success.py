@@ -54,24 +54,25 @@ def data_stages(setting: str, folder: Path) -> list[Stage]:
     return [Stage("record", f"record {setting}", record), Stage("keyframe", "find keyframes", keyframe)]
 
 
-def learning_stages(setting: str, seed: int, folder: Path) -> list[Stage]:
-    """Train with one seed, then evaluate the final checkpoint."""
-    task, _ = SETTINGS[setting]
-    training = folder / f"seed_{seed}" / "train"
+def training_stage(setting: str, seed: int, folder: Path, own: Path, preset: str = "train/default") -> Stage:
+    """Train a preset with one seed on the setting's data in ``folder``; the run goes to ``own``."""
+    training = own / "train"
     train = (
-        "lerobot-train", f"--config_path={config_files.find('train/default')}", "--policy.device=cpu",
+        "lerobot-train", f"--config_path={config_files.find(preset)}", "--policy.device=cpu",
         f"--dataset.repo_id=local/{setting}_keyframes", f"--dataset.root={folder / 'keyframes'}",
         f"--output_dir={training}", f"--seed={seed}",
     )  # fmt: skip
-    evaluate = (
-        "histmv", "eval", f"--policy.path={last_checkpoint(training)}", "--env.type=ur5", f"--env.task={task}",
-        f"--eval.n_episodes={SCENES}", f"--seed={REPORTED_SEEDS}", "--videos=0",
-        f"--output_dir={folder / f'seed_{seed}' / 'evaluation'}",
+    title = f"train {preset} on {setting}, seed {seed}"
+    return Stage("train", title, train, resume=resume_training(train, training))
+
+
+def evaluation_stage(setting: str, policy: Path, output: Path, *scenes: str) -> Stage:
+    """Evaluate a checkpoint; ``scenes`` are further options of the environment."""
+    command = (
+        "histmv", "eval", f"--policy.path={policy}", "--env.type=ur5", f"--env.task={SETTINGS[setting][0]}", *scenes,
+        f"--eval.n_episodes={SCENES}", f"--seed={REPORTED_SEEDS}", "--videos=0", f"--output_dir={output}",
     )  # fmt: skip
-    return [
-        Stage("train", f"train {setting}, seed {seed}", train, resume=resume_training(train, training)),
-        Stage("evaluate", f"evaluate on {SCENES} scenes", evaluate),
-    ]
+    return Stage(output.name, f"evaluate on {SCENES} scenes", command)
 
 
 def anywhere(command: str, output: Path, default: Path = OUTPUT) -> str:
@@ -90,7 +91,8 @@ def add_result(name: str, result: dict[str, Any], file: Path = RESULTS) -> None:
 def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict[str, str]) -> None:
     """Train and evaluate one seed and write down what came out."""
     own = folder / f"seed_{seed}"
-    run_stages(learning_stages(setting, seed, folder), own, Console(), environment)
+    evaluate = evaluation_stage(setting, last_checkpoint(own / "train"), own / "evaluation")
+    run_stages([training_stage(setting, seed, folder, own), evaluate], own, Console(), environment)
     state = read_state(own)
     (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
     add_result(

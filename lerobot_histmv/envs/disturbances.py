@@ -26,6 +26,7 @@ class Disturbances:
         action_noise: Gaussian noise of 4 mm on each axis of every commanded position; in recordings, one error for all
             key poses of a motion, and what is recorded is where the arm went.
         gripper_delay: the gripper takes its command 0.25 s late.
+        camera: name of the camera that the occluder hides and that is dead; by default each is drawn per episode.
     """
 
     # lights' brightness (by up to 0.4 of it) and direction (15 degrees), per episode
@@ -50,9 +51,12 @@ class Disturbances:
     action_noise: float = 0.0
     # delay of the gripper: 0.25 s
     gripper_delay: float = 0.0
+    # the camera that the occluder hides and that is dead; by default drawn per episode
+    camera: str = ""
 
     def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
+        strengths = {name: value for name, value in dataclasses.asdict(self).items() if name != "camera"}
+        for name, value in strengths.items():
             if not 0 <= value < float("inf"):
                 raise ValueError(f"disturbances.{name} is {value}; it must not be negative")
         for name in ("dead_camera", "moved_object"):
@@ -62,6 +66,11 @@ class Disturbances:
             raise ValueError(f"disturbances.occluder is {self.occluder}; at 3 the whole picture is hidden")
         if self.distractors > MAX_DISTRACTORS or self.distractors != int(self.distractors):
             raise ValueError(f"disturbances.distractors is {self.distractors}; a table holds 0 to {MAX_DISTRACTORS}")
+
+    def check_cameras(self, cameras: tuple[str, ...]) -> None:
+        """Raise ValueError unless the named camera is one of ``cameras``."""
+        if self.camera and self.camera not in cameras:
+            raise ValueError(f"disturbances.camera is {self.camera!r}; the cameras are {list(cameras)}")
 
     @property
     def objects(self) -> dict[str, str]:

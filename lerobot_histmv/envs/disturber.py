@@ -56,9 +56,10 @@ class Disturber:
         self._shifts = {camera: rng.normal(0, CAMERA_SHIFT, 3) for camera in cameras}
         self._focal = {camera: rng.normal(0, FOCAL_ERROR) for camera in cameras}
         fixed = [camera for camera in cameras if camera != "wrist"] or list(cameras)
-        self._hidden = fixed[rng.integers(len(fixed))]
+        hidden = fixed[rng.integers(len(fixed))]
         self._card = rng.uniform(0, max(0.0, 1 - self.strengths.occluder * CARD_WIDTH))
         dead = cameras[rng.integers(len(cameras))]
+        self._hidden, dead = (self.strengths.camera or drawn for drawn in (hidden, dead))
         self._dead = dead if rng.random() < self.strengths.dead_camera else None
         moves = rng.random() < self.strengths.moved_object and bool(self._loose)
         self._move_at = rng.integers(MOVE_WITHIN) if moves else np.inf

@@ -116,6 +116,7 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         self.image_size, self.render_size = image_size, render_size
         self.control, self.render_mode = control, render_mode
         self.instruction_split = instruction_split
+        disturbances.check_cameras(self.cameras)
         self.disturbances = disturbances
         self.record_substeps = False
         self.action_space = interface.action_space()

@@ -21,7 +21,7 @@ EVERYTHING = Disturbances(1, 1, 1, 1, 1, 1, 1, 2, 1, 1, 1)
 
 
 @contextmanager
-def disturbed(task: str = "pick_and_lift", **strengths: float) -> Iterator[UR5Env]:
+def disturbed(task: str = "pick_and_lift", **strengths: Any) -> Iterator[UR5Env]:
     env = tiny(task, disturbances=Disturbances(**strengths))
     yield env
     env.close()
@@ -78,6 +78,18 @@ def test_a_dead_camera_is_black_without_depth(clean: dict[str, Any]) -> None:
         len(cameras) == 1 and not one[f"{cameras[0]}_depth"].any() for one, cameras in zip(seen, dead, strict=True)
     )
     assert {camera for (camera,) in dead} == {"front", "left_shoulder", "wrist"}
+
+
+def test_the_camera_that_suffers_may_be_named(clean: dict[str, Any]) -> None:
+    with disturbed(dead_camera=1, camera="left_shoulder") as env:
+        seen = [first(env, seed) for seed in range(5)]
+    assert all(not one["pixels"]["left_shoulder"].any() and one["pixels"]["wrist"].any() for one in seen)
+    with disturbed(occluder=1, camera="wrist") as env:
+        observation = first(env)
+    same = {camera: equal(image, observation["pixels"][camera]) for camera, image in clean["pixels"].items()}
+    assert same == {"front": True, "left_shoulder": True, "wrist": False}
+    with pytest.raises(ValueError, match=r"disturbances\.camera is 'side'; the cameras are \['front'"):
+        tiny("pick_and_lift", disturbances=Disturbances(camera="side"))
 
 
 def test_an_occluder_hides_part_of_one_fixed_camera(clean: dict[str, Any]) -> None:

@@ -1,0 +1,88 @@
+"""What the parts bring: files of ``configs/ablation/`` on the same demonstrations, training seeds and unseen scenes.
+
+    python benchmarks/ablations.py --setting=push_buttons --files full mva_st --seeds 0 1 2
+    python benchmarks/ablations.py --setting=pick_and_lift --files full history_st --scenes clean dead_camera occluder
+
+Data are those of ``success.py``, which are recorded once. Killed and started again, it continues. Successes per file,
+seed and kind of scene, and which views acted, go to ``benchmarks/results/ablations.json``.
+"""
+
+import argparse
+import json
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from success import OUTPUT, SETTINGS, add_result, anywhere, data_stages, evaluation_stage, training_stage
+
+from dataset_tools import config_files
+from dataset_tools.demo import last_checkpoint
+from dataset_tools.eval_results import read_episodes
+from dataset_tools.evaluate import EPISODES_FILE
+from dataset_tools.stages import read_state, run_stages
+
+RESULTS = Path(__file__).parent / "results" / "ablations.json"
+FOLDER = "ablation/"
+FILES = [name.removeprefix(FOLDER) for name in config_files.names() if name.startswith(FOLDER)]
+SCENES: dict[str, tuple[str, ...]] = {
+    "clean": (),
+    "dead_camera": ("--env.disturbances.dead_camera=1",),
+    "occluder": ("--env.disturbances.occluder=2",),
+}
+"""Kinds of scenes; the same seeds in each, so that the rows of a table are paired."""
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """What one evaluation found, with the number of decisions that each view took."""
+    (task,) = json.loads((folder / "eval_info.json").read_text())["per_task"]
+    views = Counter(view for one in read_episodes(folder / EPISODES_FILE) for view in one.views)
+    found = ("n_successes", "n_episodes", "wilson_95", "failures")
+    return {name: task[name] for name in found} | {"views": dict(sorted(views.items()))}
+
+
+def ablate(args: argparse.Namespace, file: str, seed: int, environment: dict[str, str]) -> None:
+    """Train one file with one seed, evaluate it on every kind of scene and write down what came out."""
+    folder = args.output / args.setting
+    own = folder / f"{file}_seed_{seed}"
+    train = training_stage(args.setting, seed, folder, own, FOLDER + file)
+    policy = last_checkpoint(own / "train")
+    evaluations = {
+        kind: evaluation_stage(args.setting, policy, own / f"evaluation_{kind}", *SCENES[kind]) for kind in args.scenes
+    }
+    run_stages([train, *evaluations.values()], own, Console(), environment)
+    state = read_state(own)
+    add_result(
+        f"{args.setting}, {file}, seed {seed}",
+        {
+            "demonstrations": SETTINGS[args.setting][1],
+            "threads": args.threads,
+            "training_minutes": round(state["train"].seconds / 60, 1),
+            "scenes": {kind: outcome(own / f"evaluation_{kind}") for kind in args.scenes},
+            "commands": [anywhere(" ".join(record.command), args.output) for record in state.values()],
+        },
+        RESULTS,
+    )
+
+
+def main() -> None:
+    """Run the chosen files with all training seeds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--setting", choices=SETTINGS, default="push_buttons")
+    parser.add_argument("--files", nargs="+", choices=FILES, default=FILES)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["clean"])
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    args = parser.parse_args()
+    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
+    folder = args.output / args.setting
+    run_stages(data_stages(args.setting, folder), folder, Console(), environment)
+    for file in args.files:
+        for seed in args.seeds:
+            ablate(args, file, seed, environment)
+
+
+if __name__ == "__main__":
+    main()
