@@ -28,6 +28,7 @@ class PolicyCommand:
         register_third_party_plugins()
         arguments = list(args)
         if {"-h", "--help"} & set(arguments):
+            sys.argv[0] = prog  # what the usage line names
             parser.print_scoped_help(cls, arguments)
             sys.exit(0)
         path = parser.get_path_arg("policy", arguments)

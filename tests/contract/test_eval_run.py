@@ -4,6 +4,7 @@ import dataclasses
 import json
 import logging
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -250,9 +251,11 @@ def test_command_line_reads_the_policy_as_lerobot_eval_does(
     assert "fake_lift" in shown.out and "of 2" in shown.out and "Loading weights" not in shown.out + shown.err
 
 
-def test_help_teaches_the_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_teaches_the_options(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["pytest"])
     with pytest.raises(SystemExit):
         main(["eval", "--help", "--env.type=ur5"])
     shown = capsys.readouterr().out
+    assert shown.startswith("usage: histmv eval ")
     for option in ("--policy.path", "--env.task", "--eval.n_episodes", "--seed", "--videos", "--output_dir"):
         assert option in shown
