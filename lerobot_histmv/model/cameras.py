@@ -35,7 +35,8 @@ class Workspace(nn.Module):
         """``normalise`` for maps, and which pixels hold a measurement inside the box; the others become 0."""
         centre, half = (rearrange(part, "c -> c 1 1") for part in (self.centre, (self.high - self.low) / 2))
         scaled = (cloud - centre) / COORDINATE_UNIT
-        valid = (scaled.abs() <= half / COORDINATE_UNIT).all(dim=2) & (depth > 0)
+        x, y, z = (scaled.abs() <= half / COORDINATE_UNIT).unbind(2)
+        valid = x & y & z & (depth > 0)
         return scaled * valid[:, :, None], valid
 
 
@@ -47,6 +48,7 @@ def deproject(
     """World coordinates [m] of every pixel of depth images [m]; a pixel's centre is (column, row)."""
     y, x = depth_nkyx.shape[-2:]
     fx, fy, cx, cy = (rearrange(part, "n k -> n k 1") for part in intrinsics_nk4.unbind(-1))
+    extrinsics_nk34 = extrinsics_nk34.contiguous()  # the maps take over the order in which its axes lie in memory
     right, down, ahead = extrinsics_nk34[..., :3].unbind(-1)
     # The ray of pixel (u, v) is affine in u and v, so the whole map of rays is two broadcast sums.
     origin = ahead - right * cx / fx - down * cy / fy
@@ -57,6 +59,12 @@ def deproject(
     return torch.addcmul(
         rearrange(extrinsics_nk34[..., 3], "n k c -> n k c 1 1"), across + along, depth_nkyx[:, :, None]
     )
+
+
+def squared_distances(cloud_m3yx: Float[Tensor, "m 3 y x"], points_m3: Float[Tensor, "m 3"]) -> Float[Tensor, "m y x"]:
+    """Squared distance [m^2] of every pixel's world point from one point each."""
+    x, y, z = (cloud_m3yx - points_m3[:, :, None, None]).unbind(1)
+    return (x * x).addcmul_(y, y).addcmul_(z, z)
 
 
 def project(

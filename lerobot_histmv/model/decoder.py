@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_histmv.model.cameras import squared_distances
 from lerobot_histmv.model.config import DecoderConfig
-from lerobot_histmv.model.layers import ConvBlock, full_precision, upsample_to
+from lerobot_histmv.model.layers import ConvBlock, full_precision, group_norm, resize_bilinear, upsample_to
 
 TEMPERATURE = 0.1
 LOCAL_CHANNELS = 24
@@ -61,8 +62,8 @@ def around_peak(
     Where the heat map is torn between two objects, its expectation over all pixels lies at neither.
     """
     peak = heat.flatten(1).argmax(dim=1)
-    centre = cloud.flatten(2).gather(2, repeat(peak, "m -> m c 1", c=3))
-    near = (cloud - centre[..., None]).square().sum(dim=1) < PEAK_REACH**2
+    centre = cloud.flatten(2).gather(2, repeat(peak, "m -> m c 1", c=3))[..., 0]
+    near = squared_distances(cloud, centre) < PEAK_REACH**2
     kept = heat * near
     share = kept.sum(dim=(-2, -1))
     return kept / share[:, None, None], share
@@ -79,7 +80,7 @@ class Merge(nn.Module):
         super().__init__()
         self.coarse = nn.Conv2d(coarse, channels_out, 3, padding=1, bias=False)
         self.skip = nn.Conv2d(skip, channels_out, 3, padding=1)
-        self.norm = nn.GroupNorm(4, channels_out) if normalise else nn.Identity()
+        self.norm = group_norm(channels_out) if normalise else nn.Identity()
 
     def forward(self, maps: Float[Tensor, "m c y x"], skip: Float[Tensor, "m s y2 x2"]) -> Float[Tensor, "m e y2 x2"]:
         """Decoded map of the skip's height and width."""
@@ -110,8 +111,7 @@ class PositionDecoder(nn.Module):
         for merge, skip in zip(self.merge, reversed(skips), strict=True):
             maps = merge(maps, skip)
             decoded.append(maps)
-        logits = functional.interpolate(self.heat(maps), size=size, mode="bilinear", align_corners=False)
-        return rearrange(logits, "m 1 y x -> m y x"), decoded[-2]
+        return resize_bilinear(rearrange(self.heat(maps), "m 1 y x -> m y x"), size), decoded[-2]
 
 
 class PoseDecoder(nn.Module):

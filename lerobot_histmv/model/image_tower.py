@@ -20,6 +20,15 @@ UNREADABLE = (OSError, EOFError, RuntimeError, AttributeError, StopIteration, pi
 """What reading a file raises that is missing, cut off, of another network, or that holds code instead of weights."""
 
 
+def resized(rgb: Float[Tensor, "n 3 y x"], size: tuple[int, int]) -> Float[Tensor, "n 3 y2 x2"]:
+    """Images of another size: means over areas when shrinking, else bicubic."""
+    if rgb.shape[-2:] == (2 * size[0], 2 * size[1]):  # seven times as fast as torch's area mode on a CPU
+        even, odd = rearrange(rgb, "n c (y i) x -> i n c y x", i=2)
+        even, odd = rearrange(even + odd, "n c y (x j) -> j n c y x", j=2)
+        return (even + odd).div_(4)
+    return functional.interpolate(rgb, size=size, mode="area" if rgb.shape[-1] > size[1] else "bicubic")
+
+
 class ImageTower(nn.Module):
     """Base of the towers: ``images`` of a subclass gives vectors of ``width`` numbers.
 
@@ -50,8 +59,7 @@ class ImageTower(nn.Module):
 
     def prepared(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y2 x2"]:
         """Colours in [0, 1] resized and standardised for the network."""
-        mode = "area" if rgb.shape[-1] > self.size[1] else "bicubic"
-        return (functional.interpolate(rgb, size=self.size, mode=mode) - self.mean) / self.std
+        return resized(rgb, self.size).sub(self.mean).div_(self.std)
 
     def fingerprint(self) -> str:
         """Tells towers whose ``images`` differ: a digest of the image network's weights and of the preprocessing."""

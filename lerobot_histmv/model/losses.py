@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from lerobot_histmv.model.cameras import squared_distances
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
 
@@ -29,7 +30,7 @@ def heat_loss(
     Many key poses lie in free space, above the object that they are about: it is the nearest surface.
     """
     seen = log_heat > -torch.inf
-    distance = (cloud - target[:, :, None, None]).square().sum(dim=1).masked_fill(~seen, torch.inf).flatten(1)
+    distance = squared_distances(cloud, target).masked_fill_(~seen, torch.inf).flatten(1)
     near = distance.amin(dim=1) < HEAT_REACH**2
     wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
     log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]

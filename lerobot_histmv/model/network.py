@@ -1,10 +1,11 @@
 """The whole network on one screen: features, fusion, view attention, history, decoder (paper figure 2)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from einops import rearrange, reduce
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
 from lerobot_histmv.model.cameras import Workspace, deproject, pose_heat_map, project
@@ -74,6 +75,14 @@ class Encoding:
     valid: Bool[Tensor, "n k y x"]
     weights: Float[Tensor, "n k"]
     eyes: Float[Tensor, "n k 3"]
+
+
+def pick_images(images: Shaped[Tensor, "nk *s"], views: Int[Tensor, "m 2"], k: int) -> Shaped[Tensor, "m *s"]:
+    """Images of (step, view) pairs, out of all views of all steps; the same tensor where the pairs are all, in order.
+
+    Even a slice of all of them would be a copy in the backward pass, and one in another memory layout.
+    """
+    return images if len(views) == len(images) else images[views[:, 0] * k + views[:, 1]]
 
 
 class HistMVNet(nn.Module):
@@ -155,17 +164,14 @@ class HistMVNet(nn.Module):
 
     def decode(self, encoding: Encoding, enriched: Float[Tensor, "n d h w"], views: Int[Tensor, "m 2"]) -> Prediction:
         """Decode (step, view) pairs given as rows of ``views``."""
-        step, view = views.unbind(-1)
-        n, k = encoding.weights.shape
-        every = len(views) == n * k  # all pairs in order: no copy, and the maps keep their memory layout
-        image = slice(None) if every else step * k + view
+        pick = partial(pick_images, views=views, k=encoding.weights.shape[1])
         return self.decoder(
-            enriched[step],
-            encoding.features.flatten(0, 1)[image],
-            [skip[image] for skip in encoding.skips],
-            encoding.cloud.flatten(0, 1)[image],
-            encoding.valid.flatten(0, 1)[image],
-            encoding.eyes.flatten(0, 1)[image],
+            enriched[views[:, 0]],
+            pick(encoding.features.flatten(0, 1)),
+            [pick(skip) for skip in encoding.skips],
+            pick(encoding.cloud.flatten(0, 1)),
+            pick(encoding.valid.flatten(0, 1)),
+            pick(encoding.eyes.flatten(0, 1)),
         )
 
     def decode_best(
@@ -204,10 +210,9 @@ class HistMVNet(nn.Module):
 
     def heat_cloud(self, encoding: Encoding, views: Int[Tensor, "m 2"]) -> Float[Tensor, "m 3 y x"]:
         """World points [m] under the heat maps of decoded pairs: of the pair's view, or of all views of its step."""
-        step, view = views.unbind(-1)
         if self.config.views.decode == "all":
             return rearrange(encoding.cloud, "n k c y x -> n c (k y) x")
-        return encoding.cloud[step, view]
+        return pick_images(encoding.cloud.flatten(0, 1), views, encoding.weights.shape[1])
 
     @staticmethod
     def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:

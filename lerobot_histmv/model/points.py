@@ -16,6 +16,14 @@ def gather_points(values: Float[Tensor, "n p c"], indices: Int[Tensor, "n *q"]) 
     return values[batch, indices]
 
 
+def exact_distances(centres: Float[Tensor, "n c 3"], points: Float[Tensor, "n p 3"]) -> Float[Tensor, "n c p"]:
+    """Distance [m] of all pairs.
+
+    Not by the faster product form, which cancels to centimetres of error for points far from the origin.
+    """
+    return torch.cdist(centres, points, compute_mode="donot_use_mm_for_euclid_dist")
+
+
 def farthest_points(points: Float[Tensor, "n p 3"], valid: Bool[Tensor, "n p"], count: int) -> Int[Tensor, "n c"]:
     """Indices of ``count`` farthest points: each next one is the valid point farthest from all chosen before.
 
@@ -26,8 +34,8 @@ def farthest_points(points: Float[Tensor, "n p 3"], valid: Bool[Tensor, "n p"], 
     picks = []
     for _ in range(count):
         picks.append(chosen)
-        centre = gather_points(points, chosen[:, None])
-        nearest = torch.minimum(nearest, (points - centre).square().sum(dim=-1))
+        distances = exact_distances(gather_points(points, chosen[:, None]), points)
+        nearest = torch.minimum(nearest, distances[:, 0])
         chosen = nearest.argmax(dim=1)
     return torch.stack(picks, dim=1)
 
@@ -40,9 +48,7 @@ def ball_query(
     count: int,
 ) -> Int[Tensor, "n c m"]:
     """Indices of the ``count`` nearest valid points within ``radius`` [m]; the nearest fills the missing places."""
-    # The faster product form of the distance cancels to centimetres of error for points far from the origin.
-    exact = torch.cdist(centres, points, compute_mode="donot_use_mm_for_euclid_dist")
-    distances = exact.masked_fill(~valid[:, None], torch.inf)
+    distances = exact_distances(centres, points).masked_fill(~valid[:, None], torch.inf)
     near, indices = distances.topk(min(count, points.shape[1]), dim=-1, largest=False)
     return torch.where(near <= radius, indices, indices[..., :1])
 

@@ -153,7 +153,7 @@ def test_trained_clip_started_from_a_file_does_belong_to_the_checkpoint(clip_fil
     trained = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(clip_file), train_clip=True))
     policy = tiny_policy(tiny_config(network=trained))
     with torch.no_grad():
-        for parameter in policy.get_optim_params():
+        for parameter in policy.get_optim_params()[0]["params"]:
             parameter.add_(0.01)
     policy.save_pretrained(tmp_path)
     assert act(HistMVPolicy.from_pretrained(tmp_path)).equal(act(policy))

@@ -11,6 +11,7 @@ import pytest
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
+from helpers.gradients import assert_same_gradients
 from helpers.ranks import in_ranks
 from tiny_policy import TASK, episode, stack, tiny_config, tiny_policy, window
 from tiny_scene import tiny_network
@@ -94,7 +95,4 @@ def test_ranks_give_the_gradients_of_one_big_batch(way: Any, choice: str, tmp_pa
     for rank in range(RANKS):
         found = torch.load(tmp_path / f"{rank}.pt")
         assert found.keys() == expected.keys()
-        for name, gradient in found.items():
-            torch.testing.assert_close(
-                gradient, expected[name], rtol=1e-4, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}"
-            )
+        assert_same_gradients(list(found.values()), [expected[name] for name in found], list(found))

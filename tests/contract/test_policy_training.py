@@ -33,7 +33,8 @@ def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) ->
         if parameter.requires_grad:
             assert parameter.grad is not None, name
             assert parameter.grad.isfinite().all(), name
-    assert sum(p.requires_grad for p in policy.parameters()) == len(policy.get_optim_params())
+    (group,) = policy.get_optim_params()
+    assert sum(p.requires_grad for p in policy.parameters()) == len(group["params"])
 
 
 @pytest.mark.parametrize("training", [True, False])
