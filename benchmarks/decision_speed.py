@@ -2,15 +2,17 @@
 
     python benchmarks/decision_speed.py [--threads=2] [--episodes=4] [--profile]
 
-Writes ``benchmarks/results/decision_speed.json`` for the default network with the tiny CLIP and with a ViT-B/32-sized
-one (random weights: only time matters). Wall-clock figures mean something only on an idle machine, so the load and the
-processor time are recorded beside them. ``--profile`` prints instead how much each part of the tiny network takes.
+Writes ``benchmarks/results/decision_speed.json`` for the default network with the tiny CLIP and with a frozen ViT-B/32
+in both precisions (random weights: only time matters). Wall-clock figures mean something only on an idle machine, so
+the load and the processor time are recorded beside them. ``--profile`` prints instead how much each part of the tiny
+network takes.
 """
 
 import argparse
 import json
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +21,7 @@ from typing import Any
 os.environ |= {"HF_HUB_OFFLINE": "1"}
 
 import numpy as np
+import open_clip
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor, nn
@@ -32,18 +35,18 @@ RESULTS = Path(__file__).parent / "results" / "decision_speed.json"
 CAMERAS = ("front", "left_shoulder", "wrist")
 SIZE, STEPS, SEED, FOCAL = 128, 9, 0, 150.0
 TASK = "pick up the red cube and lift it"
-CLIPS = ("tiny", "ViT-B-32")
+LARGE = "ViT-B-32"
 
 
-def make_policy(clip: str) -> HistMVPolicy:
-    """The default policy for three views, untrained."""
+def make_policy(semantics: SemanticsConfig | None = None) -> HistMVPolicy:
+    """The default policy for three views, untrained; with another CLIP than its own tiny one."""
     vectors = {keys.STATE: 14, keys.INTRINSICS: 4 * len(CAMERAS), keys.EXTRINSICS: 12 * len(CAMERAS)}
     inputs = {key: PolicyFeature(FeatureType.STATE, (count,)) for key, count in vectors.items()}
     for camera in CAMERAS:
         inputs[keys.rgb_key(camera)] = PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))
         inputs[keys.depth_key(camera)] = PolicyFeature(FeatureType.VISUAL, (1, SIZE, SIZE))
     config = HistMVConfig(
-        network=NetworkConfig(semantics=SemanticsConfig(clip_model=clip)),
+        network=NetworkConfig(semantics=semantics or SemanticsConfig()),
         cameras=list(CAMERAS),
         instructions={TASK: [TASK]},
         input_features=inputs,
@@ -92,13 +95,22 @@ def decision_times(policy: HistMVPolicy, episodes: int) -> tuple[list[float], li
     return wall, cpu
 
 
-def measure(clip: str, episodes: int) -> dict[str, Any]:
+def settings(folder: str) -> list[SemanticsConfig]:
+    """The tiny CLIP, and a frozen one whose weights come from a file in ``folder``, as pretrained ones do."""
+    weights = f"{folder}/{LARGE}.pt"
+    torch.save(open_clip.create_model(LARGE).state_dict(), weights)
+    large = [SemanticsConfig(clip_model=LARGE, clip_pretrained=weights, bfloat16=half) for half in (False, True)]
+    return [SemanticsConfig(), *large]
+
+
+def measure(semantics: SemanticsConfig, episodes: int) -> dict[str, Any]:
     """Figures of one policy."""
-    policy = make_policy(clip)
+    policy = make_policy(semantics)
     wall, cpu = decision_times(policy, episodes)
     tower = policy.net.semantics._image_tower[0]
     return {
-        "clip_model": clip,
+        "clip_model": semantics.clip_model,
+        "image_tower": "bfloat16" if semantics.bfloat16 else "float32",
         "parameters": sum(parameter.numel() for parameter in {*policy.parameters(), *tower.parameters()}),
         "decisions": len(wall),
         "decisions_per_second": round(1e3 / float(np.median(wall)), 1),
@@ -110,7 +122,7 @@ def measure(clip: str, episodes: int) -> dict[str, Any]:
 
 def print_profile(episodes: int) -> None:
     """Share of each part of the tiny network in a decision."""
-    policy = make_policy("tiny")
+    policy = make_policy()
     parts: dict[str, nn.Module] = dict(policy.net.named_children())
     parts |= {f"rgba.{name}": module for name, module in policy.net.rgba.named_children()}
     parts |= {f"decoder.{name}": module for name, module in policy.net.decoder.named_children()}
@@ -143,11 +155,13 @@ def main() -> None:
     if options.profile:
         print_profile(options.episodes)
         return
+    with tempfile.TemporaryDirectory() as folder:
+        policies = [measure(semantics, options.episodes) for semantics in settings(folder)]
     results = {
         "command": f"python benchmarks/decision_speed.py --threads={options.threads} --episodes={options.episodes}",
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}",
         "torch": torch.__version__,
-        "policies": [measure(clip, options.episodes) for clip in CLIPS],
+        "policies": policies,
     }
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
     print(json.dumps(results, indent=2))

@@ -98,7 +98,7 @@ class Clock(TorchDispatchMode):
 
 def training_step(windows_count: int) -> Callable[[], None]:
     """What one step of ``lerobot-train`` does with a batch."""
-    policy, batch = make_policy("tiny").train(), windows(windows_count)
+    policy, batch = make_policy().train(), windows(windows_count)
     preset = policy.config.get_optimizer_preset()
     optimizer = preset.build(policy.get_optim_params())
 

@@ -46,6 +46,8 @@ class CacheClipConfig:
     clip_model: str = "ViT-B-32"
     # open_clip's tag, or a local weights file.
     clip_pretrained: str = "openai"
+    # Compute in bfloat16, as a policy with semantics.bfloat16 does: its vectors are others, if only by a little.
+    bfloat16: bool = False
     # Where CLIP runs, such as cuda.
     device: str = "cpu"
     # Replace an existing output dataset.
@@ -70,6 +72,7 @@ def run(config: CacheClipConfig) -> None:
         r3m_pretrained=config.r3m_pretrained,
         clip_model=config.clip_model,
         clip_pretrained=config.clip_pretrained,
+        bfloat16=config.bfloat16,
     )
     place = Workplace(root, {"source": str(source.root), **asdict(told)}, config.overwrite, "encoded")
     place.check_free()

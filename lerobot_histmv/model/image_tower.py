@@ -58,8 +58,8 @@ class ImageTower(nn.Module):
         raise NotImplementedError
 
     def prepared(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y2 x2"]:
-        """Colours in [0, 1] resized and standardised for the network."""
-        return resized(rgb, self.size).sub(self.mean).div_(self.std)
+        """Colours in [0, 1] resized and standardised for the network, in its precision."""
+        return resized(rgb, self.size).sub(self.mean).div_(self.std).to(next(self.network.parameters()).dtype)
 
     def fingerprint(self) -> str:
         """Tells towers whose ``images`` differ: a digest of the image network's weights and of the preprocessing."""
@@ -69,5 +69,5 @@ class ImageTower(nn.Module):
         digest = hashlib.sha256(json.dumps(told).encode())
         for name, weights in sorted(self.network.state_dict().items()):
             digest.update(name.encode())
-            digest.update(weights.detach().cpu().contiguous().numpy().tobytes())
+            digest.update(weights.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
         return digest.hexdigest()[:12]

@@ -85,4 +85,4 @@ class R3mTower(ImageTower):
     @torch.no_grad()
     def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
         """Global vectors of colours in [0, 1], of unit length."""
-        return functional.normalize(self.convnet(self.prepared(rgb)), dim=-1)
+        return functional.normalize(self.convnet(self.prepared(rgb)).float(), dim=-1)

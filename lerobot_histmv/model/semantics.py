@@ -107,7 +107,7 @@ class ClipTowers(ImageTower):
     def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
         """Global vectors of colours in [0, 1], of unit length."""
         with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
-            return self.clip.encode_image(self.prepared(rgb), normalize=True)
+            return functional.normalize(self.clip.encode_image(self.prepared(rgb)).float(), dim=-1)
 
     def text(self, sentences: list[str]) -> Float[Tensor, "n c"]:
         """Vectors of unit length of the sentences."""
@@ -146,10 +146,16 @@ class MiniLmText(nn.Module):
 
 
 def image_tower(config: SemanticsConfig, towers: ClipTowers | None = None) -> ClipTowers | R3mTower | None:
-    """The tower of ``semantics.image``; CLIP's is taken from ``towers`` if they exist."""
+    """The tower of ``semantics.image`` in its precision; CLIP's is taken from ``towers`` if they exist."""
     if config.image == "clip":
-        return towers or ClipTowers(config)
-    return R3mTower(config.r3m_pretrained) if config.r3m_pretrained else None
+        tower: ClipTowers | R3mTower = towers or ClipTowers(config)
+    elif config.r3m_pretrained:
+        tower = R3mTower(config.r3m_pretrained)
+    else:
+        return None
+    if config.bfloat16:
+        tower.network.to(torch.bfloat16)
+    return tower
 
 
 class Semantics(nn.Module):

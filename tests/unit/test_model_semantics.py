@@ -86,6 +86,23 @@ def test_local_weights_are_the_ones_used(weights_file: Path) -> None:
     assert not torch.allclose(first.text(SENTENCES, CPU), trained().text(SENTENCES, CPU), atol=1e-2)
 
 
+def test_half_precision_gives_nearly_the_same_vectors_under_another_name(weights_file: Path) -> None:
+    whole = frozen(weights_file)
+    half = Semantics(SemanticsConfig(clip_pretrained=str(weights_file), bfloat16=True))
+    expected, found = whole.images(views()), half.images(views())
+    assert found.dtype == torch.float32
+    assert not found.equal(expected), "equal vectors would mean that nothing was rounded"
+    torch.testing.assert_close(found.norm(dim=-1), torch.ones(2, 3))
+    assert torch.cosine_similarity(found, expected, dim=-1).min() > 0.999
+    assert half.text(SENTENCES, CPU).equal(whole.text(SENTENCES, CPU))
+    assert half.stored_as != whole.stored_as
+
+
+def test_trained_towers_are_not_rounded() -> None:
+    with pytest.raises(ValueError, match=r"semantics\.bfloat16=True is for frozen image towers"):
+        SemanticsConfig(bfloat16=True)
+
+
 def test_frozen_text_tower_encodes_each_sentence_once(weights_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     encoded: list[str] = []
     encode = semantics.ClipTowers.text
