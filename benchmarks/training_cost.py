@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from decision_speed import CAMERAS, CLIPS, SIZE, make_policy, observations
+from decision_speed import CAMERAS, SIZE, make_policy, observations
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
@@ -154,7 +154,7 @@ def main() -> None:
     results: dict[str, Any] = {"rows_per_window": ROWS, "views": len(CAMERAS), "pixels": SIZE, "policies": []}
     titles = "CLIP", "windows per GPU", "GFLOP", "activations", "kernels", "GPU", "arithmetic", "memory", "launches"
     print(*titles, "windows/s, 1 GPU", "8 GPUs", sep=" | ")
-    for clip in CLIPS:
+    for clip in BATCHES:
         for batch in BATCHES[clip]:
             tower, size = towers(clip, batch * ROWS * len(CAMERAS), batch + 2 * MEANINGS)
             total, parameters = fixed + each * batch + tower, base + size
