@@ -53,6 +53,8 @@ def run(config: ViewConfig) -> None:
     """
     if config.episodes < 1:
         raise ValueError(f"episodes is {config.episodes}; it must be at least 1")
+    if config.seed < 0:
+        raise ValueError(f"seed is {config.seed}; it must be at least 0")
     options = config.env
     env = make(
         options.task,

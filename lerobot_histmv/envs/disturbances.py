@@ -1,7 +1,9 @@
 """What makes episodes harder than the clean simulation, each with a strength; all off by default."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
+from numbers import Real
 
 MAX_DISTRACTORS = 6
 
@@ -20,7 +22,7 @@ class Disturbances:
         depth: noise, holes and dropouts like those of a RealSense D435.
         occluder: a grey card hangs before one fixed camera and hides 30 % of the width of its picture.
         dead_camera: probability that one camera of the episode gives black pictures without depth.
-        distractors: number of blocks that the task does not know, on free places of the table.
+        distractors: number of blocks on free places of the table, in none of the colours that the instruction names.
         moved_object: probability that, once in an episode and between two motions, one of the task's loose objects is
             moved by 3 to 6 cm.
         action_noise: Gaussian noise of 4 mm on each axis of every commanded position; in recordings, one error for all
@@ -57,7 +59,9 @@ class Disturbances:
     def __post_init__(self) -> None:
         strengths = {name: value for name, value in dataclasses.asdict(self).items() if name != "camera"}
         for name, value in strengths.items():
-            if not 0 <= value < float("inf"):
+            if not (isinstance(value, Real) and math.isfinite(value)):
+                raise ValueError(f"disturbances.{name} is {value!r}; it must be a finite number, 0 is off")
+            if value < 0:
                 raise ValueError(f"disturbances.{name} is {value}; it must not be negative")
         for name in ("dead_camera", "moved_object"):
             if getattr(self, name) > 1:

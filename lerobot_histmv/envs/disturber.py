@@ -1,7 +1,7 @@
 """Applies ``Disturbances`` to a simulation, episode by episode."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -11,7 +11,7 @@ from lerobot_histmv.envs.disturbances import Disturbances
 from lerobot_histmv.envs.sensor_noise import CARD_WIDTH, hide_behind_card, noisy_colors, stereo_depth
 from lerobot_histmv.envs.simulation import Simulation
 from lerobot_histmv.envs.tasks.base import WORKSPACE
-from lerobot_histmv.envs.tasks.colors import COLORS, HELD_OUT_COLORS
+from lerobot_histmv.envs.tasks.colors import COLORS
 from lerobot_histmv.motion import TICK, Motion
 
 BRIGHTNESS, LIGHT_ANGLE = 0.4, np.radians(15)
@@ -43,12 +43,13 @@ class Disturber:
         model = simulation.model
         self._diffuse, self._directions = model.light_diffuse.copy(), model.light_dir.copy()
 
-    def reset(self, rng: np.random.Generator, cameras: tuple[str, ...]) -> None:
+    def reset(self, rng: np.random.Generator, cameras: tuple[str, ...], named: Collection[str]) -> None:
         """Draw a new episode's disturbances; the scene is placed already.
 
         Args:
             rng: the episode's, of the disturbances' own, so that they leave the scene as it is.
             cameras: those that the environment renders.
+            named: words of the instruction; no additional block has one of these colours.
         """
         self._rng = rng
         self._light(rng)
@@ -63,7 +64,7 @@ class Disturber:
         self._dead = dead if rng.random() < self.strengths.dead_camera else None
         moves = rng.random() < self.strengths.moved_object and bool(self._loose)
         self._move_at = rng.integers(MOVE_WITHIN) if moves else np.inf
-        self._scatter(rng)
+        self._scatter(rng, named)
 
     def _light(self, rng: np.random.Generator) -> None:
         model, strength = self._simulation.model, self.strengths.lighting
@@ -73,9 +74,9 @@ class Disturber:
         turns = Rotation.from_rotvec(strength * LIGHT_ANGLE * rng.uniform(-1, 1, (count, 3)))
         model.light_dir[:] = turns.apply(self._directions)
 
-    def _scatter(self, rng: np.random.Generator) -> None:
-        """Put the additional blocks on free places of the table."""
-        palette = list((COLORS | HELD_OUT_COLORS).values())
+    def _scatter(self, rng: np.random.Generator, named: Collection[str]) -> None:
+        """Put the additional blocks on free places of the table; colours kept back from training stay unseen."""
+        palette = [rgb for color, rgb in COLORS.items() if color not in named]
         for name in self.strengths.objects:
             self._simulation.paint(name, palette[rng.integers(len(palette))])
             places = (np.array([*rng.uniform(*WORKSPACE.T), BLOCK_HEIGHT]) for _ in range(ATTEMPTS))

@@ -1,6 +1,7 @@
 """What goes into the environment and what comes out: options, spaces, and the checks on actions."""
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 from gymnasium import spaces
@@ -50,8 +51,8 @@ def check_options(
         )
     low, high = IMAGE_SIZES
     for name, size in (("image_size", image_size), ("render_size", render_size)):
-        if not low <= size <= high:
-            raise ValueError(f"{name} is {size}; it must lie between {low} and {high} pixels")
+        if not (isinstance(size, Integral) and low <= size <= high):
+            raise ValueError(f"{name} is {size!r}; it must be a whole number between {low} and {high} pixels")
 
 
 def fixed_variation(task: str, variation: int | None) -> int | None:
@@ -64,8 +65,9 @@ def fixed_variation(task: str, variation: int | None) -> int | None:
     if variation is None:
         return named
     count = len(found.variations)
-    if not 0 <= variation < count:
-        raise ValueError(f"variation {variation} of {task} does not exist; there are 0 to {count - 1}")
+    if not (isinstance(variation, Integral) and 0 <= variation < count):
+        names = ", ".join(suites.variation_names(found.name))
+        raise ValueError(f"variation {variation!r} of {task} does not exist; there are 0 to {count - 1} ({names})")
     if named not in (None, variation):
         raise ValueError(f"task {task} is variation {named}, but variation is {variation}; give one of the two")
     return int(variation)

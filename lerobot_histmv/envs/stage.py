@@ -59,7 +59,7 @@ class Stage:
         self.simulation.reset()
         self.task.reset(self.simulation, variation, rng)
         if self.disturber is not None:
-            self.disturber.reset(rng.spawn(1)[0], cameras)
+            self.disturber.reset(rng.spawn(1)[0], cameras, named=self.task.goal)
             self.controller.gripper_delay = self.disturber.gripper_delay
         self.simulation.refresh()
         self.controller.reset(self.task.initial_gripper)

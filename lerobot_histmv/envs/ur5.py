@@ -70,8 +70,14 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
     by ``options={"variation": i}`` leaves the objects' places as they are. Seeds below 100,000 are for recording, those
     up to 199,999 for evaluation during training, those from 200,000 for reported results.
 
-    **Info**: ``is_success`` bool, ``instruction`` str, ``variation`` int, ``ticks`` (control periods so far) and
-    ``failure``: empty until an episode is truncated, then the first that holds of
+    **Kept back** from recording and training: three paraphrases of every instruction
+    (``instruction_split="held_out"``); orange, pink and white as colours of what is to be lifted (task
+    ``pick_and_lift_unseen_colors``); cylinders, hexagonal prisms and bricks as its shapes
+    (``pick_and_lift_unseen_shapes``).
+
+    **Info**: ``is_success`` bool, ``instruction`` str, ``variation`` int, ``ticks`` (control periods so far), in
+    chains ``stages`` (name -> whether it is done) and ``failure``: empty until an episode is truncated, then the first
+    that holds of
 
     | failure | meaning |
     |---|---|

@@ -16,6 +16,7 @@ from tiny_ur5 import AWAY, expert_actions, tiny
 from lerobot_histmv.envs import UR5Env
 from lerobot_histmv.envs.configuration_ur5 import UR5EnvConfig
 from lerobot_histmv.envs.disturbances import Disturbances
+from lerobot_histmv.envs.tasks.colors import COLORS
 
 EVERYTHING = Disturbances(1, 1, 1, 1, 1, 1, 1, 2, 1, 1, 1)
 
@@ -112,6 +113,15 @@ def test_distractors_lie_free_and_the_expert_still_succeeds() -> None:
             assert info["is_success"]
 
 
+def test_distractors_have_no_colour_that_is_named_or_kept_back() -> None:
+    allowed = {rgb for color, rgb in COLORS.items() if color != "purple"}
+    with disturbed("pick_and_lift.purple", distractors=6) as env:
+        for seed in range(10):
+            env.reset(seed=seed)
+            colors = [env.stage.simulation.model.material(f"distractor{i}_paint").rgba[:3] for i in range(6)]
+            assert all(np.isclose(list(allowed), color).all(axis=1).any() for color in colors)
+
+
 def moved(before: dict[str, tuple[float, ...]], after: dict[str, tuple[float, ...]]) -> list[str]:
     gone = [name for name in before if before[name] != after[name]]
     assert all(0.02 < np.linalg.norm(np.subtract(before[name], after[name])) < 0.07 for name in gone)
@@ -169,7 +179,8 @@ def test_a_late_gripper_is_still_closing_when_the_step_ends() -> None:
     ("strengths", "message"),
     [
         ({"depth": -1}, r"disturbances\.depth is -1; it must not be negative"),
-        ({"rgb_noise": float("nan")}, "rgb_noise is nan"),
+        ({"rgb_noise": float("nan")}, "rgb_noise is nan; it must be a finite number"),
+        ({"lighting": "strong"}, "lighting is 'strong'; it must be a finite number"),
         ({"dead_camera": 1.5}, "probability"),
         ({"distractors": 9}, "a table holds 0 to 6"),
         ({"occluder": 4}, "whole picture"),

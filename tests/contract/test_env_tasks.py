@@ -11,6 +11,8 @@ pytest.importorskip("mujoco")
 from tiny_ur5 import AWAY, above, act_until_the_end, expert_actions, tiny
 
 from lerobot_histmv.envs import UR5Env
+from lerobot_histmv.envs.tasks.stack_blocks import SIDE
+from lerobot_histmv.motion import Motion, top_down
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +84,22 @@ def test_a_pressed_button_looks_as_before(two_buttons: UR5Env) -> None:
     after, *_ = two_buttons.step(closed)
     assert two_buttons.stage.task.failure() == "time"
     np.testing.assert_allclose(before["pixels"]["front"], after["pixels"]["front"], atol=1)
+
+
+def test_a_stack_does_not_count_while_anything_is_held() -> None:
+    env = tiny("stack_blocks.two-red")
+    env.reset(seed=1)
+    task, simulation = env.stage.task, env.stage.simulation
+    other = top_down(simulation.position(task.unwanted[0]), simulation.yaw(task.unwanted[0]))
+    env.execute(Motion(via=(other.raised(0.12),), target=other, gripper=0.0))
+    assert simulation.gripped(task.unwanted[0])
+    for level, name in enumerate(task.wanted[:2]):
+        simulation.place_free(name, simulation.position("plane") + np.array([0, 0, SIDE * (level + 0.5)]), 0)
+    simulation.refresh()
+    assert not env.is_success()
+    env.execute(Motion(via=(), target=simulation.tool_pose(), gripper=1.0))
+    assert env.is_success()
+    env.close()
 
 
 def test_why_reaching_failed() -> None:

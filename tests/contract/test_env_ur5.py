@@ -231,8 +231,12 @@ def test_wild_actions_break_nothing() -> None:
         ({"task": "pick_and_lift", "cameras": ("front", "back")}, "front, left_shoulder, wrist"),
         ({"task": "pick_and_lift", "cameras": ()}, "different names"),
         ({"task": "pick_and_lift", "control": "torque"}, "macro, servo"),
+        ({"task": "turn_tap."}, "turn_tap.left, turn_tap.right"),
         ({"task": "pick_and_lift", "variation": 6}, "0 to 5"),
+        ({"task": "turn_tap", "variation": "left"}, "turn_tap.left, turn_tap.right"),
+        ({"task": "pick_and_lift", "variation": 0.5}, "variation 0.5"),
         ({"task": "pick_and_lift", "image_size": 4}, "between 8 and 1024"),
+        ({"task": "pick_and_lift", "render_size": 64.5}, "render_size is 64.5; it must be a whole number"),
         ({"task": "pick_and_lift", "instruction_split": "test"}, "train, held_out"),
     ],
 )

@@ -28,5 +28,7 @@ def test_the_expert_is_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_bad_options_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="episodes is 0"):
         run(draccus.parse(ViewConfig, args=["--env.task=turn_tap", "--episodes=0"]))
+    with pytest.raises(ValueError, match="seed is -3"):
+        run(draccus.parse(ViewConfig, args=["--env.task=turn_tap", "--seed=-3"]))
     with pytest.raises(ValueError, match="accepted are reach_target"):
         run(draccus.parse(ViewConfig, args=["--env.task=juggle"]))

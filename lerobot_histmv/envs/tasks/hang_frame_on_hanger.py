@@ -35,7 +35,8 @@ class HangFrameOnHanger(Task):
     | scene | board at x 0.48 to 0.56, y -0.1 to 0.1 m; stand at x 0.30 to 0.36, y -0.2 to 0.2 m; |
     | | each turned by up to 22 degrees |
     | variations | one |
-    | success | the frame hangs on the hook and is not held |
+    | success | the frame hangs on the hook and is not held (RLBench: held or not; a frame that is carried |
+    | | does not hang) |
     | failure | grasp missed: the gripper closed beside the frame's tab |
     | macro steps | 6: above, grasp, up, before the hook, over it, down |
     | difficulty | the rail goes over the hook's raised tip, then down by its length |

@@ -34,7 +34,8 @@ class InsertOntoSquarePeg(Task):
     | scene | middle peg at x 0.46 to 0.56, y -0.1 to 0.1 m, turned by up to 22 degrees; ring at x 0.28 to 0.36, |
     | | y -0.24 to 0.24 m, turned by up to 60 degrees |
     | variations | six colours, on the left, middle or right peg; the two others differ |
-    | success | the ring is on the named peg, less than 5 cm up, and not held |
+    | success | the ring is on the named peg, less than 5 cm up, and not held (RLBench: held or not; it should |
+    | | stay there by itself) |
     | failure | time: the ring was held; grasp missed; not reached |
     | macro steps | 5: above, grasp, up, over the peg, down |
     | difficulty | 2.5 mm of play on each side |

@@ -30,7 +30,8 @@ class PickAndLift(ColorTask):
     | objects | three cubes of 4 cm and 50 g |
     | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 10 cm apart, any yaw |
     | variations | six colours |
-    | success | the named cube is held and its centre is above 0.2 m (RLBench: held, inside a ball that is shown) |
+    | success | the named cube is held and its centre is above 0.2 m (RLBench: held, inside a ball that is shown; |
+    | | a ball would hide cubes, and no instruction here names it) |
     | failure | wrong object: another cube was held |
     | macro steps | 4: above, grasp, above, carry |
     | difficulty | none beyond finding the cube: 1 cm aside is still a grasp |

@@ -18,7 +18,7 @@ UNDER_THE_TABLE = -0.73
 
 
 class PickAndLiftUnseenColors(PickAndLift):
-    """``pick_and_lift`` with colours that no training task shows or names.
+    """``pick_and_lift`` with colours that no training task names or gives to what it names.
 
     | | |
     |---|---|

@@ -25,10 +25,11 @@ class PickUpCup(PickAndLift):
 
     | | |
     |---|---|
-    | objects | three cups, 7 cm high |
+    | objects | three cups, 7 cm high (RLBench: two) |
     | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 12 cm apart |
     | variations | six colours |
-    | success | the named cup is held and its foot is above 0.2 m |
+    | success | the named cup is held and its foot is above 0.2 m (RLBench: held, away from where it stood; that |
+    | | would count a cup that is dragged) |
     | failure | wrong object: another cup was held |
     | macro steps | 4: above the rim, grasp, above, carry |
     | difficulty | one finger goes into the cup: the rim must be met within 2 cm |

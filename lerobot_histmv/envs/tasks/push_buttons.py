@@ -49,7 +49,8 @@ class PushButtons(ColorTask):
     | objects | three buttons whose caps spring back: a pressed one looks as before (RLBench's change colour) |
     | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 14 cm apart |
     | variations | 18: six single colours (0 to 5), six pairs (6 to 11), six triples (12 to 17) |
-    | success | exactly the named buttons were pressed by 3 mm, in order (RLBench forgives other buttons) |
+    | success | exactly the named buttons were pressed by 3 mm, in order (RLBench forgives other buttons, |
+    | | so that pressing all of them again and again would do) |
     | failure | wrong object: another button, or a named one out of turn, was pressed |
     | macro steps | 2 per button: above, push |
     | difficulty | what was pressed does not show: the order must be remembered |

@@ -32,7 +32,8 @@ class PutItemInDrawer(Drawers):
     | objects | a cabinet with three drawers, a block on its top |
     | scene | as in open_drawer; the item anywhere on the middle of the top, any yaw |
     | variations | bottom, middle, top |
-    | success | the item is inside the named drawer and not held |
+    | success | the item is inside the named drawer and not held (RLBench: held or not; an item in the |
+    | | gripper is not put away) |
     | failure | wrong object: another handle was grasped |
     | macro steps | 9: before the handle, grasp, pull; away, above the item, grasp; up, over the drawer, down |
     | difficulty | long; nothing but the history tells the way to the item from the way to the handle |

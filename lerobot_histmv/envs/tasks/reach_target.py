@@ -30,7 +30,8 @@ class ReachTarget(ColorTask):
     | objects | three balls of 2 cm radius that hang in the air and can be passed through |
     | scene | x 0.3 to 0.6, y -0.28 to 0.28, z 0.05 to 0.20 m, at least 12 cm apart on the ground plan |
     | variations | six colours |
-    | success | the tool is within 2 cm of the named ball's centre when a step ends (RLBench: also in passing) |
+    | success | the tool is within 2 cm of the named ball's centre when a step ends (RLBench: also in passing; |
+    | | a key pose is where the tool stops) |
     | failure | wrong object: the tool came to another ball |
     | macro steps | 2: over the target, down to it |
     | difficulty | 2 cm is the tolerance of the whole position: of depth, too |

@@ -35,7 +35,8 @@ class StackBlocks(Task):
     | objects | a white square; four blocks of the named colour, two of another (RLBench: four of another) |
     | scene | x 0.3 to 0.6, y -0.28 to 0.28 m, at least 9 cm apart, any yaw |
     | variations | two, three or four blocks of six colours |
-    | success | that many named blocks stand on each other over the square, and none is held |
+    | success | that many named blocks stand on each other over the square, and nothing is held (RLBench: they |
+    | | are in a region over the square; there, blocks that lean on each other count) |
     | failure | wrong object: a block of the other colour was held |
     | macro steps | 11, 17, 23: above, grasp, above, over, place; away and the same again |
     | difficulty | 2 cm off the square's centre is a failure; the history tells how many blocks are left |
@@ -63,7 +64,7 @@ class StackBlocks(Task):
     def place(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Everything anywhere, at least 9 cm apart."""
         names = [f"block{i}" for i in rng.permutation(6)]
-        self._named, self._others = names[:4], names[4:]
+        self._blocks, self._named, self._others = names, names[:4], names[4:]
         plane, *places = scatter(rng, 7, APART)
         simulation.place_fixed("plane", (*plane, 0))
         for name, (x, y) in zip(names, places, strict=True):
@@ -86,7 +87,7 @@ class StackBlocks(Task):
     def is_success(self, simulation: "Simulation") -> bool:
         """A named block at each of the lowest levels, and nothing held."""
         levels = self._levels(simulation)
-        return set(range(COUNTS[self.goal[0]])) <= levels and not any(map(simulation.gripped, self._named))
+        return set(range(COUNTS[self.goal[0]])) <= levels and not any(map(simulation.gripped, self._blocks))
 
     def _levels(self, simulation: "Simulation") -> set[int]:
         """Levels of the tower over the square that named blocks fill."""

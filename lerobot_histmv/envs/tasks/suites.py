@@ -61,10 +61,10 @@ def find(name: str) -> tuple[type[Task], int | None]:
     Raises:
         ValueError: there is no such task or variation.
     """
-    task, _, words = name.partition(".")
+    task = name.partition(".")[0]
     if task not in TASKS:
         raise ValueError(f"task is {name!r}; accepted are {', '.join(TASKS)}")
-    if not words:
+    if name == task:
         return TASKS[task], None
     names = variation_names(task)
     if name not in names:

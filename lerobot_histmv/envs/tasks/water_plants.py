@@ -39,6 +39,7 @@ class WaterPlants(Task):
     | | the spout points to the plant within 30 degrees |
     | variations | one |
     | success | five drops are in the pot; a can tilted by more than 45 degrees loses one every 50 ms |
+    | | (RLBench: it loses all at once where its head comes to a point over the pot, tilted or not) |
     | failure | time: the can was held, but the pot is not watered |
     | macro steps | 6: above, grasp, up, spout over the pot, half the tilt, the whole tilt |
     | difficulty | a tilt of 62 degrees with the spout kept in place; five drops cannot be poured twice |
