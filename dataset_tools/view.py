@@ -14,6 +14,7 @@ from dataset_tools.eval_settings import REPORTED_SEEDS
 from dataset_tools.record import RecordEnvConfig
 from dataset_tools.video import VideoWriter
 from lerobot_histmv.envs import UR5Env, make
+from lerobot_histmv.envs.tasks import suites
 from lerobot_histmv.motion import TICK
 
 END_FRAMES = 20
@@ -31,7 +32,10 @@ def has_display() -> bool:
 
 @dataclass
 class ViewConfig:
-    """Watch the expert of a task: histmv view --env.task=turn_tap."""
+    """Watch the expert of a task: histmv view --env.task=turn_tap.
+
+    Of several tasks, or a suite, one is shown after the other.
+    """
 
     # the task and its options, as for `histmv record`
     env: RecordEnvConfig = field(default_factory=lambda: RecordEnvConfig(image_size=256))
@@ -39,14 +43,14 @@ class ViewConfig:
     seed: int = REPORTED_SEEDS
     # scenes to show, one after the other
     episodes: int = 1
-    # open an interactive window; without one, a video is written
+    # open an interactive window; without one, videos are written
     window: bool = field(default_factory=has_display)
-    # the video, cameras side by side; by default outputs/view/<task>_<seed>.mp4
-    output: Path | None = None
+    # folder of the videos, one per task, with the cameras side by side
+    output: Path = Path("outputs/view")
 
 
 def run(config: ViewConfig) -> None:
-    """Show or film the expert.
+    """Show or film the experts.
 
     Raises:
         ValueError: an option is not accepted.
@@ -55,17 +59,22 @@ def run(config: ViewConfig) -> None:
         raise ValueError(f"episodes is {config.episodes}; it must be at least 1")
     if config.seed < 0:
         raise ValueError(f"seed is {config.seed}; it must be at least 0")
+    for task in suites.expand(config.env.task):
+        view(task, config, Console(highlight=False))
+
+
+def view(task: str, config: ViewConfig, console: Console) -> None:
+    """Show or film the expert of one task."""
     options = config.env
     env = make(
-        options.task,
+        task,
         cameras=tuple(options.cameras),
         image_size=options.image_size,
         render_size=options.image_size,
         variation=options.variation,
         disturbances=options.disturbances,
     )
-    path = config.output or Path("outputs/view") / f"{options.task}_{config.seed}.mp4"
-    console = Console(highlight=False)
+    path = config.output / f"{task}_{config.seed}.mp4"
     with window(env) if config.window else film(env, path) as show:
         for seed in range(config.seed, config.seed + config.episodes):
             _, info = env.reset(seed=seed)
@@ -73,9 +82,9 @@ def run(config: ViewConfig) -> None:
                 for motion in env.expert():
                     env.execute(motion)
             outcome = "success" if env.is_success() else env.failure()
-            console.print(f"{options.task}, scene {seed}: {info['instruction']}: {outcome}", soft_wrap=True)
+            console.print(f"{task}, scene {seed}: {info['instruction']}: {outcome}", soft_wrap=True)
         if config.window:
-            console.print("close the window to end")
+            console.print("close the window to go on")
     env.close()
     if not config.window:
         console.print(f"video: {path}", soft_wrap=True)

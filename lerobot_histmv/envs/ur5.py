@@ -122,6 +122,10 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         self.image_size, self.render_size = image_size, render_size
         self.control, self.render_mode = control, render_mode
         self.instruction_split = instruction_split
+        if not isinstance(disturbances, Disturbances):
+            raise ValueError(
+                f"disturbances is {disturbances!r}; it must be a lerobot_histmv.envs.disturbances.Disturbances"
+            )
         disturbances.check_cameras(self.cameras)
         self.disturbances = disturbances
         self.record_substeps = False
