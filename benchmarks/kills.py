@@ -3,8 +3,8 @@
     python benchmarks/kills.py DENSE [--kills=50] [--folder=outputs/kills]
 
 Keyframes the dataset at DENSE once undisturbed, then again in two processes, killed after a random time and started
-again. After each kill all finished episodes must still be there, byte for byte. Results go to
-``benchmarks/results/kills.json``.
+again, until ``--kills`` of them were killed. After each kill all finished episodes must still be there, byte for byte;
+a run that finishes before its kill is compared and begun again. Results go to ``benchmarks/results/kills.json``.
 """
 
 import argparse
@@ -47,8 +47,8 @@ def digests(parts: Path) -> dict[str, str]:
     return {name: sha256((parts / name).read_bytes()).hexdigest() for name in finished(parts)}
 
 
-def killed(dense: Path, output: Path, chance: random.Random) -> None:
-    """One run, killed with all its processes; returns early if it finishes."""
+def killed(dense: Path, output: Path, chance: random.Random) -> bool:
+    """One run, killed with all its processes after a random time; False if it finished before."""
     parts, run = output.with_name(f"{output.name}.parts"), start(dense, output)
     before = finished(parts)
     while run.poll() is None and finished(parts) <= before and not output.exists():
@@ -60,6 +60,7 @@ def killed(dense: Path, output: Path, chance: random.Random) -> None:
         os.killpg(run.pid, signal.SIGKILL)
     if run.wait() not in (0, -signal.SIGKILL):
         raise RuntimeError(f"histmv keyframe refused to go on: {run.returncode}; see {parts}")
+    return run.returncode != 0
 
 
 def rows(root: Path) -> list[dict]:
@@ -79,23 +80,22 @@ def main() -> None:
     whole, output = args.folder / "undisturbed", args.folder / "killed"
     if start(args.dense, whole).wait() != 0:
         raise RuntimeError(f"histmv keyframe fails on {args.dense}")
-    chance, lost, rounds, completed = random.Random(0), 0, 0, 0
-    parts = output.with_name(f"{output.name}.parts")
-    for _ in tqdm(range(args.kills), unit="kill"):
+    chance, lost, completed = random.Random(0), 0, 0
+    parts, bar = output.with_name(f"{output.name}.parts"), tqdm(total=args.kills, unit="kill")
+    while bar.n < args.kills:
         before = digests(parts)
-        killed(args.dense, output, chance)
-        if output.exists():  # a finished run: begin again
+        bar.update(killed(args.dense, output, chance))
+        if output.exists():  # finished, perhaps killed just after: begin again
             completed += 1
             lost += rows(output) != rows(whole)
             shutil.rmtree(output)
-            continue
-        after = digests(parts)
-        lost += sum(after.get(name) != digest for name, digest in before.items())
-        rounds += 1
+        else:
+            after = digests(parts)
+            lost += sum(after.get(name) != digest for name, digest in before.items())
     if start(args.dense, output).wait() != 0:
         raise RuntimeError(f"histmv keyframe refused to go on; see {parts}")
     same = rows(output) == rows(whole)
-    write_json(RESULTS, {"kills": rounds, "finished_runs": completed, "lost_episodes": lost, "same_result": same})
+    write_json(RESULTS, {"kills": bar.n, "finished_runs": completed, "lost_episodes": lost, "same_result": same})
     print(RESULTS.read_text())
 
 

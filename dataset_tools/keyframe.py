@@ -27,6 +27,9 @@ from dataset_tools.simplify import Method
 from dataset_tools.source import Source, open_source
 from dataset_tools.workplace import Workplace
 
+ReplayUse = Literal["off", "flag", "drop"]
+"""Named, because draccus shows no help for a field whose line holds more text in quotes than its default."""
+
 
 @dataclass
 class SourceConfig:
@@ -117,7 +120,7 @@ class KeyframeConfig(KeyframingConfig):
     output: OutputConfig
     # Execute each episode's key poses in the scene it was recorded in (data of histmv record only): off, flag (tell
     # which fail) or drop (leave those out).
-    replay: Literal["off", "flag", "drop"] = "off"
+    replay: ReplayUse = "off"
     # Processes; the result does not depend on their number.
     workers: int = 2
     # Replace an existing output dataset.

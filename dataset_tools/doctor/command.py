@@ -27,8 +27,8 @@ class DoctorConfig:
 
     Looked at are all numbers (NaN, time gaps, duplicates, quaternions, actions that are not reached, calibration) and
     the images of some episodes (damage, depth unit, invalid depth, views that disagree). Each finding tells where,
-    what, and what to do about it; docs/doctor.md explains every check. The exit code is 1 if there is an error, else 0.
-    Nothing is changed.
+    what, and what to do about it; docs/doctor.md explains every check. The exit code is 1 if there is an error or a
+    warning, else 0. Nothing is changed.
     """
 
     dataset: SourceConfig
@@ -38,6 +38,8 @@ class DoctorConfig:
     sampled_episodes: int = 10
     # What is to be trained. With any, what only histmv needs (depth, calibration, a tool pose) is noted, not an error.
     policy: Policy = "histmv"
+    # Exit with 0 in spite of warnings, once you have read them; errors still give 1.
+    accept_warnings: bool = False
     # Also write all findings to this JSON file.
     json: Path | None = None
 
@@ -47,7 +49,7 @@ class DoctorConfig:
 
 
 def run(config: DoctorConfig) -> None:
-    """Look, print, write JSON if wanted; exits with 1 if there is an error."""
+    """Look, print, write JSON if wanted; exits with 1 if something is to be mended."""
     console = Console()
     examination, root = diagnose(config, console)
     report.show(examination, console)
@@ -55,7 +57,8 @@ def run(config: DoctorConfig) -> None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, report.as_json(config.dataset.repo_id, str(root), examination))
         console.print(f"findings: {config.json}", highlight=False, soft_wrap=True)
-    if any(finding.severity == Severity.ERROR for finding in examination.findings):
+    grave = {Severity.ERROR} if config.accept_warnings else {Severity.ERROR, Severity.WARNING}
+    if any(finding.severity in grave for finding in examination.findings):
         sys.exit(1)
 
 

@@ -63,7 +63,10 @@ def verdict(examination: Examination) -> str:
     told = ", ".join(
         f"{counts[severity]} {severity}{'s'[: counts[severity] - 1]}" for severity in Severity if severity in counts
     )
-    ready = "not ready for training" if counts[Severity.ERROR] else "ready for training"
+    if counts[Severity.ERROR]:
+        ready = "not ready for training"
+    else:
+        ready = "to be looked at before training" if counts[Severity.WARNING] else "ready for training"
     return f"{ready}: {told} in {seen}"
 
 

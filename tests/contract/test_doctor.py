@@ -352,17 +352,29 @@ def doctor(root: Path, *options: str) -> int:
     return 0
 
 
-def test_the_exit_code_tells_errors_and_json_tells_all(
+def test_commands_that_contact_keeps_from_being_reached_are_noted(healthy: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(healthy, tmp_path / "dense")
+
+    def press(values: np.ndarray) -> None:
+        values[1::4, 2] -= 0.05
+
+    numbers(keys.ACTION, press)(root)
+    found = look(root)
+    assert {(one.check, one.severity) for one in found} == {("action_not_reached", Severity.NOTE)}
+
+
+def test_the_exit_code_tells_what_is_to_be_mended_and_json_tells_all(
     healthy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, told = shutil.copytree(healthy, tmp_path / "dense"), tmp_path / "told/findings.json"
     assert doctor(root) == 0
     assert "healthy: nothing found in 3 episodes" in capsys.readouterr().out
     tool(flip_odd)(root)
-    assert doctor(root) == 0
-    assert "ready for training: 6 warnings" in capsys.readouterr().out
+    assert doctor(root) == 1
+    assert "to be looked at before training: 6 warnings" in capsys.readouterr().out
+    assert doctor(root, "--accept_warnings=true") == 0
     numbers("timestamp", late)(root)
-    assert doctor(root, f"--json={told}") == 1
+    assert doctor(root, "--accept_warnings=true", f"--json={told}") == 1
     out = capsys.readouterr().out
     assert "not ready for training: 1 error, 6 warnings" in out
     assert "time_gap" in out
