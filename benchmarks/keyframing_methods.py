@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from keyframing_peers import PEERS
-from paths import KINDS, RATE, paths
+from paths import KINDS, RATE, SMOOTH, paths
 from tqdm import tqdm
 
 from dataset_tools import exact, simplify
@@ -159,8 +159,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=10, help="paths per kind and length")
     count = parser.parse_args().count
     results = {
-        "same_table": [row for kind in KINDS for n, k in SIZES for row in compared(kind, n, k, count)],
-        "whole_method": [whole(kind, frames, count) for kind in KINDS for frames in WHOLE],
+        "same_table": [row for kind in SMOOTH for n, k in SIZES for row in compared(kind, n, k, count)],
+        "whole_method": [whole(kind, frames, count) for kind in SMOOTH for frames in WHOLE],
         "as_printed": [row for kind in KINDS for row in printed_and_default(kind, 100, count)],
     }
     write_json(RESULTS, results)
