@@ -16,6 +16,8 @@ from typing import Any
 
 NORMAL_975 = 1.959963984540054
 """97.5 % quantile of the normal distribution: two-sided 95 % intervals."""
+INFO_FILE = "eval_info.json"
+"""LeRobot's name for the results of an evaluation."""
 OUT_OF_STEPS = "time"
 """Failure of an episode that ended without success and without a reason."""
 

@@ -21,14 +21,14 @@ from rich.console import Console
 
 from dataset_tools.eval_checkpoint import Pilot, check_fits, fingerprint, load_config
 from dataset_tools.eval_report import circumstances, progress_bar, results_table, success_rate
-from dataset_tools.eval_results import Episode, EpisodeLog, evaluation_info
+from dataset_tools.eval_results import INFO_FILE, Episode, EpisodeLog, evaluation_info
 from dataset_tools.eval_rollout import Rollout, Scenes
 from dataset_tools.eval_settings import EvaluateConfig
 from dataset_tools.locks import only_one
 from dataset_tools.shards import write_json
 from dataset_tools.video import TEMPORARY
 
-EPISODES_FILE, SETTINGS_FILE, INFO_FILE = "episodes.jsonl", "settings.json", "eval_info.json"
+EPISODES_FILE, SETTINGS_FILE = "episodes.jsonl", "settings.json"
 UNRELATED_ENV = ("task", "features", "features_map", "render_size", "max_parallel_tasks", "disable_env_checker")
 """Fields of an environment's configuration that do not change what an episode of one task is."""
 

@@ -1,15 +1,16 @@
 """The card of a trained policy: what it was trained on, what it expects and returns, and how to evaluate it."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import ModelCard, ModelCardData
+from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from huggingface_hub.constants import HUGGINGFACE_CO_URL_HOME
 
 import lerobot_histmv
 from lerobot_histmv import keys
+from lerobot_histmv.calibration_text import calibration_table
 from lerobot_histmv.configuration_histmv import HistMVConfig
 
 LICENSE = "apache-2.0"
@@ -32,6 +33,7 @@ def model_card(
     dataset_meta: Any = None,
     license: str | None = None,
     tags: Sequence[str] | None = None,
+    evaluation: Mapping[str, Any] | None = None,
 ) -> ModelCard:
     """Card of a policy.
 
@@ -41,8 +43,11 @@ def model_card(
         dataset_meta: LeRobot's metadata of the training data, if they are at hand.
         license: the Hub's name of a licence.
         tags: beside ``PROJECT_TAGS``.
+        evaluation: content of an ``eval_info.json`` of ``histmv eval``, if the policy was measured.
     """
     data = ModelCardData(
+        model_name=config.repo_id or "HistMV policy",
+        eval_results=_eval_results(evaluation) if evaluation else None,
         license=license or config.license or LICENSE,
         library_name="lerobot",
         pipeline_tag="robotics",
@@ -51,7 +56,11 @@ def model_card(
     )
     parts = [f"# {config.repo_id or 'HistMV policy'}", _opening(config), "## Data and training"]
     parts.append(_training(config, training, dataset_meta))
-    parts += [f"## Conventions\n\n{CONVENTIONS}", _instructions(config), _evaluation(config)]
+    if dataset_meta is not None and keys.INTRINSICS in dataset_meta.features:
+        parts.append(f"## Calibration of the training data\n\n{calibration_table(dataset_meta)}")
+    parts += [f"## Conventions\n\n{CONVENTIONS}", _instructions(config)]
+    parts.append(f"## Measured success\n\n{_measured(evaluation)}")
+    parts += [_again(config, training), _evaluation(config)]
     text = "\n\n".join(parts)
     return ModelCard(f"---\n{data.to_yaml()}\n---\n\n{text}\n")
 
@@ -100,12 +109,53 @@ def _instructions(config: HistMVConfig) -> str:
     return f"## Instructions\n\nTrained with {len(known)} instructions and their paraphrases:\n\n{listed}{rest}"
 
 
+def _eval_results(evaluation: Mapping[str, Any]) -> list[EvalResult]:
+    """The successes as the Hub's front matter tells them."""
+    return [
+        EvalResult(
+            task_type="robotics",
+            task_name=task["task"],
+            dataset_type=f"ur5/{task['task']}",
+            dataset_name=f"{task['n_episodes']} unseen scenes of {task['task']}",
+            metric_type="success_rate",
+            metric_name="success [%]",
+            metric_value=round(task["pc_success"], 1),
+        )
+        for task in evaluation["per_task"]
+    ]
+
+
+def _measured(evaluation: Mapping[str, Any] | None) -> str:
+    if not evaluation:
+        return "Not told here; the last command measures it."
+    lines = ["| task | success | 95 % interval (Wilson) | failures |", "|---|---|---|---|"]
+    for task in evaluation["per_task"]:
+        low, high = task["wilson_95"]
+        failures = ", ".join(f"{kind} {count}" for kind, count in task["failures"].items()) or "none"
+        share = f"{task['n_successes']} of {task['n_episodes']}"
+        lines.append(f"| `{task['task']}` | {share} | {low:.1f} to {high:.1f} % | {failures} |")
+    seeds = evaluation["seeds"]
+    return "\n".join([*lines, "", f"Scenes {seeds['first']} to {seeds['last']} of the environment `ur5`."])
+
+
+def _again(config: HistMVConfig, training: Any) -> str:
+    """How to train the same."""
+    if not training:
+        return "## Training it again\n\nNot told."
+    path = config.repo_id or "USER/NAME"
+    return (
+        "## Training it again\n\nThe checkpoint holds the settings of its training:\n\n```bash\n"
+        f"lerobot-train --config_path={path} --dataset.root=null --policy.push_to_hub=false "
+        "--output_dir=outputs/again\n```"
+    )
+
+
 def _evaluation(config: HistMVConfig) -> str:
     path, cameras = config.repo_id or "USER/NAME", ",".join(config.cameras)
     env = f"--env.type=ur5 --env.task=TASK --env.cameras=[{cameras}] --env.image_size={config.image_size[0]}"
     return (
-        "## Evaluation\n\nNo results are told here. To measure the success on unseen scenes, TASK being one of those "
-        "that the data shows:\n\n```bash\n"
+        "## Evaluation\n\nTo measure the success on unseen scenes, TASK being one of those that the data shows:\n\n"
+        "```bash\n"
         "pip install 'lerobot_policy_histmv[sim]'\n"
         f"lerobot-eval --policy.path={path} {env} --eval.n_episodes=100\n"
         f"histmv eval --policy.path={path} {env} --eval.n_episodes=100  # with intervals and reasons of failures\n```"

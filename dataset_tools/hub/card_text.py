@@ -5,17 +5,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from huggingface_hub.constants import HUGGINGFACE_CO_URL_HOME
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from dataset_tools.hub.card_commands import keyframe_command, record_command
 from dataset_tools.record_place import RECORDING_FILE
 from lerobot_histmv import keys
+from lerobot_histmv.calibration_text import calibration_table
 
 INSTALL = "pip install 'lerobot_policy_histmv[sim]'"
-STANDING = 1e-6
-"""A camera whose pose changes less [m, or entries of the rotation] is a fixed one."""
 
 CONVENTIONS = """## Conventions
 
@@ -35,7 +33,7 @@ def sections(root: Path, meta: LeRobotDatasetMetadata) -> list[str]:
     if keyframing:
         found.append(_keyframing(keyframing))
     if keys.INTRINSICS in meta.features and keys.EXTRINSICS in meta.features:
-        found.append(_calibration(meta))
+        found.append(f"## Calibration\n\n{calibration_table(meta)}")
         # Data of other origin may be calibrated and still order its quaternions otherwise.
         found += [CONVENTIONS] if tuple(meta.features[keys.ACTION]["names"] or ())[:8] == keys.POSE_NAMES else []
     found.append(_instructions(root, meta))
@@ -106,20 +104,6 @@ def _keyframing(told: Mapping[str, Any]) -> str:
     }
     notices = "".join(f"\n* {notice}" for notice in told["notices"])
     return f"## Keyframing\n\n{table(rows)}" + (f"\n\nNotes:\n{notices}" if notices else "")
-
-
-def _calibration(meta: LeRobotDatasetMetadata) -> str:
-    """Mean intrinsics and, of fixed cameras, the position."""
-    cameras = keys.cameras_of(meta.features[keys.INTRINSICS]["names"])
-    mean = np.asarray(meta.stats[keys.INTRINSICS]["mean"]).reshape(len(cameras), 4)
-    low, high = (np.asarray(meta.stats[keys.EXTRINSICS][end]).reshape(len(cameras), 3, 4) for end in ("min", "max"))
-    lines = ["| camera | size | fx, fy, cx, cy [pixels] | position [m] |", "|---|---|---|---|"]
-    for camera, values, first, last in zip(cameras, mean, low, high, strict=True):
-        fixed = np.abs(last - first).max() < STANDING
-        where = ", ".join(f"{value:.3f}" for value in first[:, 3]) if fixed else "moves"
-        size = meta.features.get(keys.rgb_key(camera), {}).get("shape", ("?", "?"))
-        lines.append(f"| {camera} | {size[1]} x {size[0]} | {', '.join(f'{v:.2f}' for v in values)} | {where} |")
-    return "## Calibration\n\n" + "\n".join(lines)
 
 
 def _instructions(root: Path, meta: LeRobotDatasetMetadata) -> str:

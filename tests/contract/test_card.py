@@ -1,5 +1,6 @@
 """Cards state how data were made, so exactly that their commands make the same again; what people wrote stays."""
 
+import hashlib
 import json
 import shlex
 from pathlib import Path
@@ -14,6 +15,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from tiny_policy import TASK, tiny_config, tiny_policy
 
 from dataset_tools import cli
+from dataset_tools.eval_results import INFO_FILE, Episode, evaluation_info
 from dataset_tools.hub import card
 from dataset_tools.hub.card_commands import record_command
 from dataset_tools.record import RecordConfig, checked_settings
@@ -138,5 +140,47 @@ def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) ->
         "from camera to world",
         f"* {TASK}",
         "lerobot-eval --policy.path=ann/policy --env.type=ur5 --env.task=TASK --env.cameras=[front,wrist]",
+        "lerobot-train --config_path=ann/policy",
+        "## Calibration of the training data",
     ):
         assert part in found.text, part
+
+
+def evaluated(folder: Path, weights: bytes) -> Path:
+    """Results of two tasks, as ``histmv eval`` writes them, of a policy with these weights."""
+    folder.mkdir()
+    finished = {
+        (task.split(".")[0], at): [
+            Episode(task, seed, seed != 23, "time" if seed == 23 else "", 3, 1.0, 1.0, TASK, 17.0, 0.5)
+            for seed in (19, 23, 29)
+        ]
+        for at, task in enumerate(("reach_target.red", "turn_tap.left"))
+    }
+    policy = {"weights_sha256": hashlib.sha256(weights).hexdigest()}
+    told = {"seeds": {"first": 19, "last": 29}, "checkpoint": "somewhere", "settings": {"policy": policy}}
+    info = evaluation_info(finished, folder, told)
+    (folder / INFO_FILE).write_text(json.dumps(info))
+    return folder
+
+
+def test_policys_card_tells_measured_success_of_this_very_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "policy"
+    tiny_policy().save_pretrained(checkpoint)
+    files = snapshot(checkpoint)
+    given = ["push", "--repo_id=ann/policy", f"--root={checkpoint}", "--upload=false"]
+    wrong = evaluated(tmp_path / "other", b"other weights")
+    with pytest.raises(SystemExit):
+        cli.main([*given, f"--evaluation={wrong}"])
+    assert "whose weights are not those given" in capsys.readouterr().err
+    assert snapshot(checkpoint) == files
+    results = evaluated(tmp_path / "evaluation", (checkpoint / "model.safetensors").read_bytes())
+    cli.main([*given, f"--evaluation={results}"])
+    found = ModelCard.load(checkpoint / card.CARD_FILE)
+    assert "| `turn_tap.left` | 2 of 3 | 20.8 to 93.9 % | time 1 |" in found.text
+    assert "Scenes 19 to 29" in found.text
+    assert [(one.task_name, one.metric_value) for one in found.data.eval_results] == [
+        ("reach_target.red", 66.7),
+        ("turn_tap.left", 66.7),
+    ]

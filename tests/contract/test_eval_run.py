@@ -18,9 +18,9 @@ from dataset_tools import overlay
 from dataset_tools.cli import main
 from dataset_tools.eval_checkpoint import PolicySource, load_config, load_policy
 from dataset_tools.eval_film import HOLD_SECONDS
-from dataset_tools.eval_results import Episode, read_episodes
+from dataset_tools.eval_results import INFO_FILE, Episode, read_episodes
 from dataset_tools.eval_settings import EvaluateConfig, ScenesConfig
-from dataset_tools.evaluate import EPISODES_FILE, INFO_FILE, Evaluation, run
+from dataset_tools.evaluate import EPISODES_FILE, Evaluation, run
 from lerobot_histmv.envs.configuration_ur5 import UR5EnvConfig
 
 SEEDS = range(200_000, 200_005)
