@@ -24,8 +24,8 @@ from tqdm import tqdm
 from dataset_tools.shards import write_json
 
 RESULTS = Path(__file__).parent / "results" / "kills.json"
-LONGEST = 12.0
-"""Seconds after which a run is killed at the latest, counted from its first finished episode."""
+KILLED_WITHIN = 0.25
+"""Share of an undisturbed run's time in which one is killed; both count from the first newly finished episode."""
 
 
 def start(dense: Path, output: Path) -> subprocess.Popen:
@@ -47,13 +47,27 @@ def digests(parts: Path) -> dict[str, str]:
     return {name: sha256((parts / name).read_bytes()).hexdigest() for name in finished(parts)}
 
 
-def killed(dense: Path, output: Path, chance: random.Random) -> bool:
-    """One run, killed with all its processes after a random time; False if it finished before."""
+def begun(dense: Path, output: Path) -> subprocess.Popen:
+    """A run that has just finished one more episode, or ended."""
     parts, run = output.with_name(f"{output.name}.parts"), start(dense, output)
     before = finished(parts)
     while run.poll() is None and finished(parts) <= before and not output.exists():
-        time.sleep(0.05)
-    deadline = time.monotonic() + chance.uniform(0, LONGEST)
+        time.sleep(0.02)
+    return run
+
+
+def undisturbed(dense: Path, output: Path) -> float:
+    """Seconds that a whole run takes from its first finished episode on."""
+    run, start = begun(dense, output), time.monotonic()
+    if run.wait() != 0:
+        raise RuntimeError(f"histmv keyframe fails on {dense}")
+    return time.monotonic() - start
+
+
+def killed(dense: Path, output: Path, seconds: float) -> bool:
+    """One run, killed with all its processes after so long; False if it finished before."""
+    parts, run = output.with_name(f"{output.name}.parts"), begun(dense, output)
+    deadline = time.monotonic() + seconds
     while run.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     if run.poll() is None:
@@ -78,13 +92,12 @@ def main() -> None:
     shutil.rmtree(args.folder, ignore_errors=True)
     args.folder.mkdir(parents=True)
     whole, output = args.folder / "undisturbed", args.folder / "killed"
-    if start(args.dense, whole).wait() != 0:
-        raise RuntimeError(f"histmv keyframe fails on {args.dense}")
+    longest = KILLED_WITHIN * undisturbed(args.dense, whole)
     chance, lost, completed = random.Random(0), 0, 0
     parts, bar = output.with_name(f"{output.name}.parts"), tqdm(total=args.kills, unit="kill")
     while bar.n < args.kills:
         before = digests(parts)
-        bar.update(killed(args.dense, output, chance))
+        bar.update(killed(args.dense, output, chance.uniform(0, longest)))
         if output.exists():  # finished, perhaps killed just after: begin again
             completed += 1
             lost += rows(output) != rows(whole)
