@@ -44,6 +44,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     args = parser.parse_args()
+    if args.steps < WARM_UP + 10:
+        parser.error(f"--steps {args.steps}: the first {WARM_UP} are not counted, so give at least {WARM_UP + 10}")
     load = os.getloadavg()[0]
     logged = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", train(args.root, args.steps, args.threads))
     updates, waits = zip(*[map(float, pair) for pair in logged[WARM_UP // 10 :]], strict=True)
