@@ -97,9 +97,14 @@ def push_checkpoint(folder: Path, given: PushConfig) -> None:
     """Upload the checkpoint in ``folder``, with a card if it is of this project's policy; or only write the card.
 
     Raises:
-        ValueError: it is damaged, the results are those of another checkpoint, or the Hub refuses.
+        ValueError: it is damaged, the results are those of another checkpoint, a card of another kind of policy is
+            wanted, or the Hub refuses.
     """
     config = PreTrainedConfig.from_pretrained(folder)
+    if not isinstance(config, HistMVConfig) and (given.evaluation or not given.upload):
+        raise ValueError(
+            f"{folder} is a policy of type {config.type}; cards, and so --evaluation and --upload=false, are for histmv"
+        )
     config.repo_id, config.pretrained_path = given.repo_id, folder
     results = measured(given.evaluation, config) if given.evaluation else None
     url = repositories.prepare(given.repo_id, given.private, "model") if given.upload else ""

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -29,7 +30,7 @@ def resized(rgb: Float[Tensor, "n 3 y x"], size: tuple[int, int]) -> Float[Tenso
     return functional.interpolate(rgb, size=size, mode="area" if rgb.shape[-1] > size[1] else "bicubic")
 
 
-class ImageTower(nn.Module):
+class ImageTower(nn.Module, ABC):
     """Base of the towers: ``images`` of a subclass gives vectors of ``width`` numbers.
 
     Args:
@@ -49,13 +50,13 @@ class ImageTower(nn.Module):
             self.register_buffer(name, rearrange(torch.tensor(tuple(values)), "c -> c 1 1"), persistent=False)
 
     @property
+    @abstractmethod
     def network(self) -> nn.Module:
         """The image network, whose weights tell towers apart."""
-        raise NotImplementedError
 
+    @abstractmethod
     def images(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n c"]:
         """Global vectors of colours in [0, 1], of unit length."""
-        raise NotImplementedError
 
     def prepared(self, rgb: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y2 x2"]:
         """Colours in [0, 1] resized and standardised for the network, in its precision."""

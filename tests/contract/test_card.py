@@ -12,6 +12,7 @@ from fake_demonstrations import CAMERAS, FAILING_SEEDS, SIZE, recorder
 from helpers.episodes import snapshot, write_picks
 from huggingface_hub import DatasetCard, ModelCard
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies.act.configuration_act import ACTConfig
 from tiny_policy import TASK, tiny_config, tiny_policy
 
 from dataset_tools import cli
@@ -184,3 +185,15 @@ def test_policys_card_tells_measured_success_of_this_very_checkpoint(
         ("reach_target.red", 66.7),
         ("turn_tap.left", 66.7),
     ]
+
+
+@pytest.mark.parametrize("option", ["--upload=false", "--evaluation=results"])
+def test_cards_of_other_policies_are_not_promised(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ACTConfig(device="cpu").save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(SystemExit):
+        cli.main(["push", "--repo_id=ann/act", f"--root={tmp_path}", option])
+    assert "is a policy of type act; cards" in capsys.readouterr().err
+    assert not (tmp_path / card.CARD_FILE).exists()

@@ -34,8 +34,11 @@ def policy_without_chance(choice: str) -> HistMVPolicy:
 
 
 def batches() -> list[dict[str, Any]]:
-    """A batch for each rank: rank 0 gets the long windows, so that the ranks differ in real rows."""
-    long, short = episode(5, seed=1), episode(1, seed=2)
+    """A batch for each rank: rank 0 gets the long windows, so that the ranks differ in real rows.
+
+    In some noise an activation lies so near to a leaky ReLU's kink that rounding decides its side; not in this.
+    """
+    long, short = episode(5, seed=5), episode(1, seed=2)
     return [
         stack([window(long, 4), window(long, 3), window(long, 1)]),
         stack([window(short, 0), window(long, 2), window(episode(2, seed=3), 1)]),
