@@ -26,6 +26,7 @@ RESULTS = Path(__file__).parent / "results" / "success.json"
 SETTINGS: dict[str, tuple[str, int]] = {
     "reach_target": ("reach_target", 50),
     "pick_and_lift": ("pick_and_lift", 50),
+    "pick_and_lift_10": ("pick_and_lift", 10),
     "pick_and_lift_fixed": ("pick_and_lift.red", 50),
     "push_buttons_fixed": ("push_buttons.red-green", 50),
     "push_buttons": ("push_buttons", 100),
