@@ -1,10 +1,12 @@
 """What the parts bring: files of ``configs/ablation/`` on the same demonstrations, training seeds and unseen scenes.
 
     python benchmarks/ablations.py --setting=push_buttons --files full mva_st --seeds 0 1 2
-    python benchmarks/ablations.py --setting=pick_and_lift --files full history_st --scenes clean dead_camera occluder
+    python benchmarks/ablations.py --setting=pick_and_lift --files full history_st --camera=wrist --scenes dead_camera
+    python benchmarks/ablations.py --setting=pick_and_lift --files full --seeds 0 1 2 --scenes clean held_out
 
-Data are those of ``success.py``, which are recorded once. Killed and started again, it continues. Successes per file,
-seed and kind of scene, and which views acted, go to ``benchmarks/results/ablations.json``.
+Data are those of ``success.py``, which are recorded once, and so are its trainings: the full network is the default
+preset. Killed and started again, it continues. Successes per file, seed and kind of scene, and which views acted, go to
+``benchmarks/results/ablations.json``.
 """
 
 import argparse
@@ -26,12 +28,20 @@ from dataset_tools.stages import read_state, run_stages
 RESULTS = Path(__file__).parent / "results" / "ablations.json"
 FOLDER = "ablation/"
 FILES = [name.removeprefix(FOLDER) for name in config_files.names() if name.startswith(FOLDER)]
+FULL = "full"
 SCENES: dict[str, tuple[str, ...]] = {
     "clean": (),
+    "held_out": ("--env.instruction_split=held_out",),
     "dead_camera": ("--env.disturbances.dead_camera=1",),
     "occluder": ("--env.disturbances.occluder=2",),
 }
 """Kinds of scenes; the same seeds in each, so that the rows of a table are paired."""
+
+
+def options(kind: str, camera: str) -> tuple[str, ...]:
+    """Options of the environment for a kind of scene; ``camera`` names the one that suffers, if not drawn."""
+    suffers = any("disturbances" in option for option in SCENES[kind])
+    return (*SCENES[kind], f"--env.disturbances.camera={camera}") if suffers and camera else SCENES[kind]
 
 
 def outcome(folder: Path) -> dict[str, Any]:
@@ -45,22 +55,23 @@ def outcome(folder: Path) -> dict[str, Any]:
 def ablate(args: argparse.Namespace, file: str, seed: int, environment: dict[str, str]) -> None:
     """Train one file with one seed, evaluate it on every kind of scene and write down what came out."""
     folder = args.output / args.setting
-    own = folder / f"{file}_seed_{seed}"
-    train = training_stage(args.setting, seed, folder, own, FOLDER + file)
+    own = folder / (f"seed_{seed}" if file == FULL else f"{file}_seed_{seed}")
+    train = training_stage(args.setting, seed, folder, own, "train/default" if file == FULL else FOLDER + file)
     policy = last_checkpoint(own / "train")
-    evaluations = {
-        kind: evaluation_stage(args.setting, policy, own / f"evaluation_{kind}", *SCENES[kind]) for kind in args.scenes
-    }
-    run_stages([train, *evaluations.values()], own, Console(), environment)
+    places = {kind: own / f"evaluation_{kind}{args.camera and '_'}{args.camera}" for kind in args.scenes}
+    evaluations = [
+        evaluation_stage(args.setting, policy, place, *options(kind, args.camera)) for kind, place in places.items()
+    ]
+    run_stages([train, *evaluations], own, Console(), environment)
     state = read_state(own)
     add_result(
-        f"{args.setting}, {file}, seed {seed}",
+        ", ".join(filter(None, [args.setting, file, f"seed {seed}", args.camera])),
         {
             "demonstrations": SETTINGS[args.setting][1],
             "threads": args.threads,
             "training_minutes": round(state["train"].seconds / 60, 1),
-            "scenes": {kind: outcome(own / f"evaluation_{kind}") for kind in args.scenes},
-            "commands": [anywhere(" ".join(record.command), args.output) for record in state.values()],
+            "scenes": {kind: outcome(place) for kind, place in places.items()},
+            "commands": [anywhere(" ".join(state[stage.name].command), args.output) for stage in [train, *evaluations]],
         },
         RESULTS,
     )
@@ -73,6 +84,7 @@ def main() -> None:
     parser.add_argument("--files", nargs="+", choices=FILES, default=FILES)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["clean"])
+    parser.add_argument("--camera", default="", help="that is dead or hidden; by default drawn per episode")
     parser.add_argument("--output", type=Path, default=OUTPUT)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     args = parser.parse_args()
