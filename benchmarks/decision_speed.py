@@ -107,7 +107,7 @@ def measure(semantics: SemanticsConfig, episodes: int) -> dict[str, Any]:
     """Figures of one policy."""
     policy = make_policy(semantics)
     wall, cpu = decision_times(policy, episodes)
-    tower = policy.net.semantics._image_tower[0]
+    tower: Any = policy.net.semantics._image_tower[0]
     return {
         "clip_model": semantics.clip_model,
         "image_tower": "bfloat16" if semantics.bfloat16 else "float32",
@@ -126,8 +126,8 @@ def print_profile(episodes: int) -> None:
     parts: dict[str, nn.Module] = dict(policy.net.named_children())
     parts |= {f"rgba.{name}": module for name, module in policy.net.rgba.named_children()}
     parts |= {f"decoder.{name}": module for name, module in policy.net.decoder.named_children()}
-    parts["clip image tower"] = policy.net.semantics._image_tower[0].clip.visual
-    parts["clip text tower"] = policy.net.semantics._text_tower[0].clip.transformer
+    image, text = (getattr(policy.net.semantics, f"_{kind}_tower")[0].clip for kind in ("image", "text"))
+    parts |= {"clip image tower": image.visual, "clip text tower": text.transformer}
     spent: dict[str, float] = dict.fromkeys(parts, 0.0)
     for name, module in parts.items():
         clock: list[float] = []

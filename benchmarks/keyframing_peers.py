@@ -117,7 +117,8 @@ def with_pymoo(problem: Problem, k: int, seed: int) -> Selection:
 
 def with_rdp_package(problem: Problem, k: int, _: int) -> Selection:
     """The package ``rdp``; its epsilon is bisected until k nodes remain."""
-    low, high, best = 0.0, 1.0, np.arange(2)
+    best: Selection = np.arange(2)
+    low, high = 0.0, 1.0
     for _ in range(20):
         middle = (low + high) / 2
         kept = np.flatnonzero(rdp_package.rdp(problem.points, epsilon=middle, algo="iter", return_mask=True))

@@ -95,7 +95,9 @@ def assert_same(first: dict[str, Any], second: dict[str, Any]) -> None:
 
 def loader_epochs(dataset: LeRobotDataset, batch_size: int, workers: int, epochs: int = 3) -> dict[str, float]:
     """Whole batches, from the first batch of warm workers on."""
-    options = {"persistent_workers": True, "multiprocessing_context": "spawn", "prefetch_factor": 2} if workers else {}
+    options: dict[str, Any] = (
+        {"persistent_workers": True, "multiprocessing_context": "spawn", "prefetch_factor": 2} if workers else {}
+    )
     loader = DataLoader(dataset, batch_size, shuffle=True, num_workers=workers, **options)
     exhaust(loader)
     started = time.perf_counter()

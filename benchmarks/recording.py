@@ -63,7 +63,7 @@ def write_fast(demonstration: Demonstration, directory: Path) -> None:
     """As ``histmv record`` does, its assembly included."""
     from dataset_tools.assembly import assemble
 
-    outcome = Outcome(0, SEED, 0, "lift", ["lift"], "", len(demonstration.actions))
+    outcome = Outcome(0, SEED, "lift", 0, "lift", ["lift"], "", len(demonstration.actions))
     outcome = commit_episode(directory, outcome, demonstration.columns())
     assemble(directory, [outcome], FEATURES, FPS, "local/fast", directory / "dataset")
 
@@ -95,8 +95,8 @@ def attempts_per_second(task: str, episodes: int, workers: int) -> dict[str, flo
     """Rows per second once all processes work: between each process's first shard and the last of all."""
     before = children_seconds()
     with tempfile.TemporaryDirectory() as scratch:
-        make_env = partial(make, task, render_size=SIZE)
-        setup = WorkerSetup(Path(scratch), make_env, CAMERA_NAMES, stride=1, seed=SEED)
+        make_env = partial(make, render_size=SIZE)
+        setup = WorkerSetup(Path(scratch), (task,), make_env, CAMERA_NAMES, stride=1, seed=SEED)
         finished = [(time.perf_counter(), outcome.rows) for outcome in make_attempts(setup, workers, {}, episodes)]
     seconds = finished[-1][0] - finished[workers - 1][0]
     cpu = 1000 * (children_seconds() - before) / sum(rows for _, rows in finished)

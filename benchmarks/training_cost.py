@@ -121,7 +121,11 @@ def towers(model: str, images: int, sentences: int) -> tuple[Cost, int]:
 def trunk() -> tuple[Cost, Cost, int]:
     """The default network without CLIP's towers: cost per step, cost per window, parameters."""
     policy = make_policy().train()
-    measured = [cost(lambda n=n: policy(windows(n))[0], list(policy.parameters())) for n in (1, 2)]
+
+    def measure(n: int) -> Cost:
+        return cost(lambda: policy(windows(n))[0], list(policy.parameters()))
+
+    measured = [measure(n) for n in (1, 2)]
     own = [
         whole + towers("tiny", n * ROWS * len(CAMERAS), 2)[0] * -1 for n, whole in zip((1, 2), measured, strict=True)
     ]

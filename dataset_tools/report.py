@@ -1,10 +1,13 @@
 """What keyframing did: per episode and in total, as JSON beside the data, as Markdown, and on the terminal."""
 
+import json
 import platform
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib.metadata import version
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from rich.table import Table
 import lerobot_histmv
 from dataset_tools.columns import Columns
 from dataset_tools.keyframes import KeyframeOptions, Keyframing
-from dataset_tools.shards import write_json
+from dataset_tools.shards import appearing_whole
 from lerobot_histmv import keys
 
 FORMAT = 1
@@ -37,7 +40,7 @@ class Report:
         options: how keyframes were chosen.
         source: repo id of the dense dataset.
         columns: columns used.
-        episodes: keyframes by episode number of the source.
+        episodes: keyframes by episode number of the source; gone through a few times, never held as a whole.
         failures: by episode, why executing its key poses failed, empty for a success; no entries without a replay.
         notices: what is missing in the dataset, was dropped or assumed.
     """
@@ -54,36 +57,41 @@ class Report:
         """Unit of errors."""
         return "rad" if self.columns.is_joints else "m"
 
+    @cached_property
     def reasons(self) -> dict[str, int]:
         """How many keyframes were kept for each reason."""
         counted = Counter(frame.reason for found in self.episodes.values() for frame in found.keyframes)
         return {reason: counted[reason] for reason in keys.REASONS}
 
+    @cached_property
     def totals(self) -> dict[str, Any]:
         """Figures over all episodes."""
-        found = list(self.episodes.values())
-        kept = sum(len(one.keyframes) for one in found)
-        gaps = [one.gap for one in found if one.optimum_mean > GAP_COUNTS_ABOVE]
+        figures = [
+            (one.frames, one.error_mean, one.error_max, one.gap, one.optimum_mean, one.seconds, bool(one.warning))
+            for one in self.episodes.values()
+        ]
+        frames, error_mean, error_max, gap, optimum_mean, seconds, warned = np.array(figures, dtype=np.float64).T
+        kept, gaps = sum(self.reasons.values()), gap[optimum_mean > GAP_COUNTS_ABOVE]
         return {
-            "episodes": len(found),
-            "frames": sum(one.frames for one in found),
+            "episodes": len(figures),
+            "frames": int(frames.sum()),
             "keyframes": kept,
-            "rows": kept - len(found),
-            "keyframes_per_episode": kept / len(found),
-            "reasons": self.reasons(),
-            "share_of_method": self.reasons()["ga"] / kept,
-            "error_mean": float(np.mean([one.error_mean for one in found])),
-            "error_max": max(one.error_max for one in found),
-            "median_gap": float(np.median(gaps)) if gaps else None,
+            "rows": kept - len(figures),
+            "keyframes_per_episode": kept / len(figures),
+            "reasons": self.reasons,
+            "share_of_method": self.reasons["ga"] / kept,
+            "error_mean": float(error_mean.mean()),
+            "error_max": float(error_max.max()),
+            "median_gap": float(np.median(gaps)) if len(gaps) else None,
             "episodes_in_median_gap": len(gaps),
-            "seconds_per_episode": float(np.mean([one.seconds for one in found])),
-            "warnings": sum(bool(one.warning) for one in found),
+            "seconds_per_episode": float(seconds.mean()),
+            "warnings": int(warned.sum()),
             "replayed": len(self.failures),
             "replay_failures": sum(map(bool, self.failures.values())),
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Content of ``meta/keyframing.json``."""
+        """Content of ``meta/keyframing.json`` but for the episodes."""
         return {
             "format": FORMAT,
             "options": asdict(self.options),
@@ -97,15 +105,14 @@ class Report:
                 "numpy": np.__version__,
                 "python": platform.python_version(),
             },
-            "totals": self.totals(),
+            "totals": self.totals,
             "replay": {str(number): failure for number, failure in self.failures.items()},
-            "episodes": [{"source_episode": number, **asdict(one)} for number, one in self.episodes.items()],
         }
 
-    def rows(self) -> list[tuple[str, ...]]:
+    def rows(self) -> Iterator[tuple[str, ...]]:
         """Cells of the table, one row per episode; the head is ``head``."""
-        return [
-            (
+        for number, one in self.episodes.items():
+            yield (
                 str(number),
                 str(one.frames),
                 str(len(one.keyframes)),
@@ -114,8 +121,6 @@ class Report:
                 f"{100 * one.gap:.2f}",
                 f"{1000 * one.seconds:.0f}",
             )
-            for number, one in self.episodes.items()
-        ]
 
     def head(self) -> tuple[str, ...]:
         """Column titles of ``rows``."""
@@ -125,7 +130,7 @@ class Report:
 
     def summary(self) -> list[str]:
         """A few lines for people."""
-        total, unit = self.totals(), f"m{self.unit}"
+        total, unit = self.totals, f"m{self.unit}"
         why = ", ".join(f"{count} {reason}" for reason, count in total["reasons"].items())
         lines = [
             f"{total['episodes']} episodes of {total['frames']} frames -> {total['keyframes']} keyframes "
@@ -144,7 +149,7 @@ class Report:
         return lines + [f"warning: {warning}" for warning in self._warnings()]
 
     def _gap(self) -> str:
-        total = self.totals()
+        total = self.totals
         limit = f"whose optimum is above {1000 * GAP_COUNTS_ABOVE:g} m{self.unit} per frame"
         if total["median_gap"] is None:
             return f"gap to the exact optimum: not told, as there is no episode {limit}"
@@ -158,25 +163,38 @@ class Report:
             found += [f"episode {number}: its key poses fail in replay ({why}); {fate}"] if why else []
         return found
 
-    def markdown(self) -> str:
+    def json_lines(self) -> Iterator[str]:
+        """``meta/keyframing.json``, each episode on a line of its own."""
+        yield json.dumps(self.as_json(), indent=2, ensure_ascii=False).removesuffix("\n}") + ',\n  "episodes": ['
+        separator = "\n"
+        for number, one in self.episodes.items():
+            yield separator + json.dumps({"source_episode": number, **asdict(one)}, ensure_ascii=False)
+            separator = ",\n"
+        yield "\n  ]\n}\n"
+
+    def markdown_lines(self) -> Iterator[str]:
         """The report as a Markdown page."""
-        cells = [self.head(), tuple("---" for _ in self.head()), *self.rows()]
-        table = "\n".join(f"| {' | '.join(row)} |" for row in cells)
-        lines = "\n".join(f"- {line}" for line in self.summary())
-        return f"# Keyframes of {self.source}\n\n{lines}\n\n{_LEGEND}\n\n{table}\n"
+        yield f"# Keyframes of {self.source}\n\n"
+        yield from (f"- {line}\n" for line in self.summary())
+        yield f"\n{_LEGEND}\n\n"
+        for row in chain([self.head(), tuple("---" for _ in self.head())], self.rows()):
+            yield f"| {' | '.join(row)} |\n"
 
     def write(self, root: Path) -> None:
-        """Put the report into the dataset at ``root``, as JSON and as Markdown."""
-        write_json(root / keys.KEYFRAMING_FILE, self.as_json())
-        (root / keys.KEYFRAMING_FILE).with_suffix(".md").write_text(self.markdown(), encoding="utf-8")
+        """Put the report into the dataset at ``root``, as JSON and as Markdown, an episode at a time."""
+        for path, lines in (
+            (root / keys.KEYFRAMING_FILE, self.json_lines()),
+            ((root / keys.KEYFRAMING_FILE).with_suffix(".md"), self.markdown_lines()),
+        ):
+            with appearing_whole(path) as file:
+                file.writelines(lines)
 
     def show(self, console: Console) -> None:
         """Print the table and the summary."""
         table = Table(*self.head(), title=f"Keyframes of {self.source}", caption=_LEGEND)
-        rows = self.rows()
-        for row in rows[:SHOWN]:
+        for row in islice(self.rows(), SHOWN):
             table.add_row(*row)
-        if len(rows) > SHOWN:
+        if len(self.episodes) > SHOWN:
             table.add_row(*["..."] * len(self.head()))
         console.print(table)
         for line in self.summary():

@@ -9,10 +9,11 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pyarrow as pa
@@ -90,11 +91,19 @@ def write_failure(directory: Path, outcome: Outcome) -> None:
     write_json(path, dataclasses.asdict(outcome))
 
 
+@contextmanager
+def appearing_whole(path: Path) -> Iterator[TextIO]:
+    """A text file to write; it appears at ``path`` when all is written, or not at all."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
+    with temporary.open("w", encoding="utf-8") as file:
+        yield file
+    temporary.replace(path)
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write ``content``; the file appears whole or not at all."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
-    temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    with appearing_whole(path) as file:
+        file.write(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
 def delete_leftovers(directory: Path) -> None:

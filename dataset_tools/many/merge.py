@@ -2,9 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pyarrow as pa
@@ -13,34 +14,38 @@ from lerobot.datasets import aggregate
 from rich.console import Console
 
 from dataset_tools.columns import Columns
-from dataset_tools.demonstrations import understand
 from dataset_tools.hub.push import push_dataset
-from dataset_tools.keyframe import KeyframeConfig, settings_of
+from dataset_tools.keyframe import KeyframeConfig
 from dataset_tools.keyframes import Keyframing
 from dataset_tools.many.pieces import piece
 from dataset_tools.replay import SOURCE_RECORDING_FILE
 from dataset_tools.report import Report
-from dataset_tools.source import open_source
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
 
-EPISODES_FILE_MB, DATA_FILE_MB = 1, 20
-"""Size at which a file of episodes' metadata, or of rows, is closed."""
+EPISODES_FILE_MB = 1
+"""Size at which a file of episodes' metadata is closed."""
 EPISODES_FILES = "meta/episodes/chunk-*/file-*.parquet"
 
 
 @dataclass(frozen=True)
 class MergePieces:
-    """The last task of the engine.
+    """The last task of the engine; its memory does not grow with the number of episodes.
 
     Attributes:
         config: options of the whole dataset.
+        settings: what decides the result, see ``keyframe.settings_of``.
+        columns: columns of the whole dataset.
+        notices: what is missing in it or assumed about it.
         folder: where the pieces lie.
         pieces: how many there are.
         root: where the merged dataset shall be.
     """
 
     config: KeyframeConfig = field(repr=False)
+    settings: Mapping[str, Any] = field(repr=False)
+    columns: Columns = field(repr=False)
+    notices: tuple[str, ...] = field(repr=False)
     folder: Path
     pieces: int
     root: Path
@@ -58,11 +63,9 @@ class MergePieces:
                 f"{len(missing)} of {self.pieces} pieces are not finished, the first is {missing[0]}: see "
                 f"{self.folder}/logs, then give the same command again"
             )
-        config, told = self.config, self.config.dataset
-        source = open_source(told.repo_id, told.root, told.episodes, told.revision)
-        demonstrations = understand(source, config.columns)
-        report = merged_report(roots, config, demonstrations.columns, demonstrations.notices())
-        place = Workplace(self.root, settings_of(config, source), config.overwrite, "keyframed")
+        config = self.config
+        report = merged_report(roots, config, self.columns, self.notices)
+        place = Workplace(self.root, self.settings, config.overwrite, "keyframed")
 
         def write(path: Path) -> None:
             aggregated(roots, config.output.repo_id, path)
@@ -73,22 +76,23 @@ class MergePieces:
 
         with place.opened():
             place.commit(write)
-        shutil.rmtree(self.folder)
         report.show(Console())
+        shutil.rmtree(self.folder)
         Console().print(f"written to {self.root}", highlight=False, soft_wrap=True)
         if config.output.push_to_hub:
             push_dataset(self.root, config.output.repo_id, config.output.private, config.output.license)
 
 
 def aggregated(roots: Sequence[Path], repo_id: str, path: Path) -> None:
-    """LeRobot's aggregation into small files.
+    """LeRobot's aggregation, with the pieces' files of rows as they are.
 
-    LeRobot reads and writes the last file again for every piece, and would close it at 100 MB only. Rows without images
-    take more than ten times as much memory as on disk; the metadata of 10,000 episodes takes four times as long.
+    To fill files up, LeRobot would read and write the last one again for every piece: memory grows with the file, to
+    more than ten times its size for rows without images, and time with its square. The metadata of episodes are filled
+    up whatever one asks for; small files keep that cheap.
     """
     names = [f"local/{root.name}" for root in roots]
     with patch.object(aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_FILE_MB):
-        aggregate.aggregate_datasets(names, repo_id, list(roots), path, DATA_FILE_MB)
+        aggregate.aggregate_datasets(names, repo_id, list(roots), path, concatenate_data=False)
     for file in path.glob(EPISODES_FILES):
         tell_place(file)
 
@@ -106,15 +110,47 @@ def tell_place(file: Path) -> None:
     pq.write_table(table, file)
 
 
+class PiecesKeyframings(Mapping[int, Keyframing]):
+    """Keyframes by episode of the dense dataset, read from the reports of the pieces; one piece is held at a time.
+
+    Args:
+        roots: the pieces; no episode is in two of them.
+    """
+
+    def __init__(self, roots: Sequence[Path]) -> None:
+        self._held: tuple[Path | None, dict[int, Keyframing]] = (None, {})
+        self._root = {episode: root for root in roots for episode in self._of(root)}
+
+    def _of(self, root: Path) -> dict[int, Keyframing]:
+        if self._held[0] != root:
+            found = told_by(root)["episodes"]
+            self._held = (root, {one.pop("source_episode"): Keyframing.from_json(one) for one in found})
+        return self._held[1]
+
+    def __getitem__(self, episode: int) -> Keyframing:
+        return self._of(self._root[episode])[episode]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._root)
+
+    def __len__(self) -> int:
+        return len(self._root)
+
+
+def told_by(root: Path) -> dict[str, Any]:
+    """A piece's report."""
+    told: dict[str, Any] = json.loads((root / keys.KEYFRAMING_FILE).read_text(encoding="utf-8"))
+    return told
+
+
 def merged_report(roots: Sequence[Path], config: KeyframeConfig, columns: Columns, notices: Sequence[str]) -> Report:
     """The pieces' reports as one."""
-    told = [json.loads((root / keys.KEYFRAMING_FILE).read_text(encoding="utf-8")) for root in roots]
-    found = [one for report in told for one in report["episodes"]]
+    failures: dict[int, str] = {}
+    all_notices = list(notices)
+    for told in map(told_by, roots):
+        failures |= {int(number): why for number, why in told["replay"].items()}
+        all_notices += told["notices"]
+    episodes = PiecesKeyframings(roots)
     return Report(
-        options=config.options(),
-        source=config.dataset.repo_id,
-        columns=columns,
-        episodes={one.pop("source_episode"): Keyframing.from_json(one) for one in found},
-        failures={int(number): why for report in told for number, why in report["replay"].items()},
-        notices=list(dict.fromkeys([*notices, *(notice for report in told for notice in report["notices"])])),
+        config.options(), config.dataset.repo_id, columns, episodes, failures, list(dict.fromkeys(all_notices))
     )

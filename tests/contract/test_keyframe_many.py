@@ -4,6 +4,7 @@ import json
 import os
 import stat
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -13,6 +14,7 @@ from lerobot.datasets import LeRobotDataset
 from rich.console import Console
 
 from dataset_tools import cli
+from dataset_tools.keyframes import Keyframing
 from dataset_tools.many import merge
 from dataset_tools.many import pieces as many_pieces
 from lerobot_histmv import keys
@@ -42,7 +44,7 @@ def at_once(dense: Path) -> Path:
 def assert_same(root: Path, expected: Path) -> None:
     """The same rows, statistics, tasks and keyframes; only processor times may differ."""
     mine, other = (LeRobotDataset("test/keys", root=place) for place in (root, expected))
-    rows = [pq.read_table(sorted(place.glob("data/*/*.parquet"))[0]).to_pylist() for place in (root, expected)]
+    rows = [pq.read_table(place / "data").to_pylist() for place in (root, expected)]
     assert rows[0] == rows[1]
     assert mine.meta.total_episodes == other.meta.total_episodes == EPISODES
     assert mine.meta.tasks.equals(other.meta.tasks)
@@ -95,6 +97,25 @@ def test_a_stopped_run_goes_on_with_the_missing_pieces(
     cli.main(command)
     assert begun == [(0, 1, 2), (3, 4), (5, 6), (5, 6)]
     assert_same(tmp_path / "keys", at_once)
+
+
+def test_the_merged_report_holds_one_piece_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers, roots = ((0, 2), (3, 5, 7)), [tmp_path / name for name in "ab"]
+    found = {
+        number: Keyframing((), number + 11, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, "") for pair in numbers for number in pair
+    }
+    for root, own in zip(roots, numbers, strict=True):
+        (root / "meta").mkdir(parents=True)
+        told = {"episodes": [{"source_episode": number, **asdict(found[number])} for number in own]}
+        (root / keys.KEYFRAMING_FILE).write_text(json.dumps(told))
+    read: list[Path] = []
+    real = merge.told_by
+    monkeypatch.setattr(merge, "told_by", lambda root: read.append(root) or real(root))
+    lazy = merge.PiecesKeyframings(roots)
+    assert len(lazy) == len(found)
+    for _ in range(2):
+        assert list(lazy.items()) == list(found.items())
+    assert read == [*roots, *roots, *roots]  # to know the numbers, then once in each pass
 
 
 SBATCH = """#!{python}
