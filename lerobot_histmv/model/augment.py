@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from einops import einsum, rearrange
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,6 +20,7 @@ class AugmentConfig:
         brightness: additive change of each view's brightness.
         contrast: relative change of each view's colour channels.
         depth_noise: standard deviation of depth noise at 1 m, growing with z squared [m].
+        lost_view: probability that one view of a window shows nothing: black, without depth.
     """
 
     yaw: float = 0.5
@@ -28,11 +29,14 @@ class AugmentConfig:
     brightness: float = 0.06
     contrast: float = 0.1
     depth_noise: float = 0.0
+    lost_view: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 0:
                 raise ValueError(f"augment.{name}={value} is a strength and must be >= 0")
+        if self.lost_view > 1:
+            raise ValueError(f"augment.lost_view={self.lost_view} is a probability and must be <= 1")
 
 
 def uniform(shape: tuple[int, ...], like: Tensor) -> Tensor:
@@ -113,3 +117,9 @@ def jitter_colours(rgb: Float[Tensor, "n k 3 y x"], config: AugmentConfig) -> Fl
 def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tensor, "n k y x"]:
     """Gaussian noise whose deviation grows with z squared; invalid pixels stay 0."""
     return (depth + strength * depth.square() * torch.randn_like(depth)) * (depth > 0)
+
+
+def draw_lost_views(count: int, views: int, probability: float, device: torch.device) -> Bool[Tensor, "b k"]:
+    """Which view of each window is lost: one of them with ``probability``, else none."""
+    which = functional.one_hot(torch.randint(views, (count,)), views).bool()
+    return (which & (torch.rand(count, 1) < probability)).to(device)

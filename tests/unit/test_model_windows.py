@@ -1,5 +1,6 @@
 """From LeRobot's batch to packed windows: only real rows, metres, and tool positions of the past only."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -18,6 +19,9 @@ EPISODES = ((0, 7), (2, 7), (4, 5))
 """Which of the nine rows around each drawn row, the fifth, lie in its episode."""
 WINDOWS = ((0, 5), (2, 6), (4, 5))
 """Rows of each window: up to the drawn one, the first four of the episode, and an episode of one row."""
+
+
+STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0)
 
 
 def window_batch() -> dict[str, Any]:
@@ -185,3 +189,22 @@ def test_distortion_changes_images_but_no_pose_and_not_the_original() -> None:
     assert distorted.tool is window.tool
     assert distorted.action is window.action
     assert all(now.equal(then) for now, then in zip((window.rgb, window.depth, window.intrinsics), kept, strict=True))
+
+
+def test_a_lost_view_is_black_and_without_depth_in_all_steps_of_its_window() -> None:
+    window = read_window(window_batch(), CAMERAS)
+    owner, lost = window.real.nonzero()[:, 0], []
+    torch.manual_seed(0)
+    for _ in range(31):
+        without = window.distorted(replace(STILL, lost_view=0.5))
+        gone = (without.depth == 0).all(dim=-1).all(dim=-1)
+        assert (without.rgb[gone] == 0).all()
+        assert without.rgb[~gone].equal(window.rgb[~gone])
+        assert without.depth[~gone].equal(window.depth[~gone])
+        per_window = torch.stack([gone[owner == b][0] for b in range(B)])
+        assert gone.equal(per_window[owner])
+        assert (per_window.sum(dim=1) <= 1).all()
+        lost.append(per_window)
+    counts = torch.cat(lost).float().sum(dim=0)
+    assert (counts > 0).all()
+    assert 0.3 < counts.sum() / (31 * B) < 0.7
