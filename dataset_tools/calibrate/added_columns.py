@@ -89,8 +89,13 @@ def _add_features(path: Path, features: Mapping[str, dict[str, Any]]) -> None:
 
 
 def _add_statistics(path: Path, statistics: Mapping[int, Statistics]) -> None:
-    """Statistics of the new columns in the episodes' metadata, one column each, as LeRobot names them."""
+    """Statistics of the new columns in the episodes' metadata, one column each, as LeRobot names them.
+
+    LeRobot's ``remove_feature`` leaves the statistics of what it removed: those of the same names go first.
+    """
     table = pq.read_table(path)
+    added = {f"stats/{name}/" for name in next(iter(statistics.values()))}
+    table = table.drop_columns([name for name in table.column_names if name[: name.rfind("/") + 1] in added])
     episodes = [statistics[episode] for episode in table["episode_index"].to_pylist()]
     for name, of_first in episodes[0].items():
         for statistic in of_first:

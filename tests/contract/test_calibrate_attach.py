@@ -12,7 +12,7 @@ import yaml
 from helpers import episodes as synthetic
 from helpers.foreign_episodes import Scene, looking_at, tool_camera
 from lerobot.datasets import LeRobotDataset
-from lerobot.datasets.dataset_tools import delete_episodes
+from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
 from lerobot.datasets.io_utils import load_stats
 
 from dataset_tools import cli
@@ -108,6 +108,14 @@ def test_it_is_the_dataset_that_would_have_been_recorded(attached: LeRobotDatase
 def test_lerobots_editing_tools_work(attached: LeRobotDataset, tmp_path: Path) -> None:
     edited = delete_episodes(attached, [0], output_dir=tmp_path / "edited", repo_id="test/edited")
     assert torch.equal(edited[1][keys.EXTRINSICS], attached[LENGTHS[0] + 1][keys.EXTRINSICS])
+
+
+def test_a_calibration_that_lerobot_removed_can_be_attached_again(attached: LeRobotDataset, tmp_path: Path) -> None:
+    remove_feature(attached, [keys.INTRINSICS, keys.EXTRINSICS], output_dir=tmp_path / "plain", repo_id="test/plain")
+    attach(tmp_path / "plain", tmp_path / "again", CAMERAS)
+    again = LeRobotDataset("test/rgbd", root=tmp_path / "again")
+    assert again.features.keys() == attached.features.keys()
+    assert torch.equal(again[3][keys.EXTRINSICS], attached[3][keys.EXTRINSICS])
 
 
 def test_what_cannot_be_attached_is_refused_and_leaves_nothing(
