@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_histmv.envs.tasks.base import scatter
 from lerobot_histmv.envs.tasks.colors import ColorTask
-from lerobot_histmv.motion import Motion, top_down
+from lerobot_histmv.motion import Motion, Pose, top_down
 
 if TYPE_CHECKING:
     from lerobot_histmv.envs.simulation import Simulation
@@ -21,7 +21,7 @@ CAP_TOP = 0.042
 PUSH_HEIGHT = 0.032
 """Height [m] of the tool when the expert pushes."""
 ABOVE = 0.16
-"""Height [m] of the via point over a button."""
+"""Height [m] at which the tool stops over a button."""
 
 TEMPLATES = {
     "train": (
@@ -52,8 +52,9 @@ class PushButtons(ColorTask):
     | success | exactly the named buttons were pressed by 3 mm, in order (RLBench forgives other buttons, |
     | | so that pressing all of them again and again would do) |
     | failure | wrong object: another button, or a named one out of turn, was pressed |
-    | macro steps | 2 per button: above, push |
-    | difficulty | what was pressed does not show: the order must be remembered |
+    | macro steps | 2 for the first button: above, push; 3 for each other: up again, above, push |
+    | difficulty | what was pressed does not show, and the arm is over a button twice, before its push and after: |
+    | | only the past tells whether to push or to go on |
 
     The gripper is closed from the start: it is the pushing tool. Pressing the same button twice in a row counts once.
     Every colour stands once at every place of the order. The paper's protocol, one fixed variation of two buttons, is
@@ -107,15 +108,20 @@ class PushButtons(ColorTask):
         return "time" if self._pressed else "not reached"
 
     def expert(self, simulation: "Simulation") -> Iterator[Motion]:
-        """For each button: over it without stopping, then down to the push."""
+        """For each button: over it, down to the push, up again; the episode ends with the last push."""
+        back: list[Pose] = []
         for name in self.targets:
             x, y, _ = simulation.position(name)
-            yield Motion(via=(top_down((x, y, ABOVE)),), target=top_down((x, y, PUSH_HEIGHT)), gripper=0.0, dwell=4)
+            above, push = top_down((x, y, ABOVE)), top_down((x, y, PUSH_HEIGHT))
+            for pose in (*back, above):
+                yield Motion(via=(), target=pose, gripper=0.0)
+            yield Motion(via=(), target=push, gripper=0.0, dwell=4)
+            back = [above]
 
     @classmethod
     def macro_steps(cls, variation: int) -> int:
-        """Above and push, for each named button."""
-        return 2 * len(cls.variations[variation])
+        """Above and push, for each named button, and up again between two of them."""
+        return 3 * len(cls.variations[variation]) - 1
 
     @classmethod
     def instructions(cls, variation: int, split: str) -> tuple[str, ...]:
