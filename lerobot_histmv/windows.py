@@ -88,14 +88,18 @@ class Window:
         )
 
     def distorted(self, config: augment.AugmentConfig) -> "Window":
-        """The window with shifted, recoloured images and noisy depth, and now and then without one of its views."""
+        """The window with shifted, recoloured images and noisy depth, and now and then with a view hidden or lost."""
         rgb = augment.jitter_colours(self.rgb, config)
         rgb, depth, intrinsics = augment.shift_pixels(rgb, self.depth, self.intrinsics, config.pixels)
         if config.depth_noise > 0:
             depth = augment.noisy_depth(depth, config.depth_noise)
+        windows, views = len(self.real), depth.shape[1]
+        owner = self.real.nonzero()[:, 0]
+        if config.card > 0:
+            size = (depth.shape[2], depth.shape[3])
+            rgb, depth = augment.Cards.draw(windows, views, config.card, size).hide(rgb, depth, owner)
         if config.lost_view > 0:
-            lost = augment.draw_lost_views(len(self.real), depth.shape[1], config.lost_view, depth.device)
-            shown = ~lost[self.real.nonzero()[:, 0]]
+            shown = ~augment.draw_views(windows, views, config.lost_view).to(depth.device)[owner]
             rgb, depth = rgb * shown[..., None, None, None], depth * shown[..., None, None]
         return replace(self, rgb=rgb, depth=depth, intrinsics=intrinsics)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from einops import einsum, rearrange
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -21,6 +21,7 @@ class AugmentConfig:
         contrast: relative change of each view's colour channels.
         depth_noise: standard deviation of depth noise at 1 m, growing with z squared [m].
         lost_view: probability that one view of a window shows nothing: black, without depth.
+        card: probability that a card before the camera hides a part of one view of a window, or all of it.
     """
 
     yaw: float = 0.5
@@ -30,13 +31,15 @@ class AugmentConfig:
     contrast: float = 0.1
     depth_noise: float = 0.0
     lost_view: float = 0.0
+    card: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 0:
                 raise ValueError(f"augment.{name}={value} is a strength and must be >= 0")
-        if self.lost_view > 1:
-            raise ValueError(f"augment.lost_view={self.lost_view} is a probability and must be <= 1")
+        for name in ("lost_view", "card"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"augment.{name}={getattr(self, name)} is a probability and must be <= 1")
 
 
 def uniform(shape: tuple[int, ...], like: Tensor) -> Tensor:
@@ -119,7 +122,52 @@ def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tenso
     return (depth + strength * depth.square() * torch.randn_like(depth)) * (depth > 0)
 
 
-def draw_lost_views(count: int, views: int, probability: float, device: torch.device) -> Bool[Tensor, "b k"]:
-    """Which view of each window is lost: one of them with ``probability``, else none."""
+def draw_views(count: int, views: int, probability: float) -> Bool[Tensor, "b k"]:
+    """One view of each window with ``probability``, else none."""
     which = functional.one_hot(torch.randint(views, (count,)), views).bool()
-    return (which & (torch.rand(count, 1) < probability)).to(device)
+    return which & (torch.rand(count, 1) < probability)
+
+
+CARD_SIDE = 0.3
+"""Shortest side of a card, as a share of the picture's."""
+CARD_DEPTH = (0.1, 0.4)
+"""Least and largest distance of a card [m]; as often, it gives no depth."""
+
+
+@dataclass
+class Cards:
+    """A card before each view of b windows.
+
+    Args:
+        hides: pixels that it hides; none where there is no card.
+        colour: its colour.
+        depth: its distance [m], 0 without a measurement.
+    """
+
+    hides: Bool[Tensor, "b k y x"]
+    colour: Float[Tensor, "b k 3"]
+    depth: Float[Tensor, "b k"]
+
+    @classmethod
+    def draw(cls, count: int, views: int, probability: float, size: tuple[int, int]) -> "Cards":
+        """Cards of random size, place, colour and distance, before one view of a window with ``probability``."""
+        inside = []
+        for pixels in size:
+            length = CARD_SIDE + (1 - CARD_SIDE) * torch.rand(count, 1)
+            begin = (1 - length) * torch.rand(count, 1)
+            place = (torch.arange(pixels) + 0.5) / pixels
+            inside.append((begin <= place) & (place <= begin + length))
+        hides = rearrange(inside[0], "b y -> b 1 y 1") & rearrange(inside[1], "b x -> b 1 1 x")
+        near, far = CARD_DEPTH
+        depth = (near + (far - near) * torch.rand(count, views)) * (torch.rand(count, views) < 0.5)
+        before = draw_views(count, views, probability)
+        return cls(hides & before[..., None, None], torch.rand(count, views, 3), depth)
+
+    def hide(
+        self, rgb: Float[Tensor, "n k 3 y x"], depth: Float[Tensor, "n k y x"], owner: Int[Tensor, " n"]
+    ) -> tuple[Float[Tensor, "n k 3 y x"], Float[Tensor, "n k y x"]]:
+        """Colours and depth of rows that belong to the windows ``owner``, with the cards before the cameras."""
+        hides, colour, far = (each.to(rgb.device)[owner] for each in (self.hides, self.colour, self.depth))
+        return torch.where(hides[:, :, None], colour[..., None, None], rgb), torch.where(
+            hides, far[..., None, None], depth
+        )

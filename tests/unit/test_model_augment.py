@@ -159,7 +159,9 @@ def test_strength_0_changes_nothing() -> None:
     assert all(getattr(same, name).equal(getattr(window, name)) for name in ("rgb", "depth", "intrinsics"))
 
 
-@pytest.mark.parametrize("name", ["yaw", "shift", "pixels", "brightness", "contrast", "depth_noise", "lost_view"])
+@pytest.mark.parametrize(
+    "name", ["yaw", "shift", "pixels", "brightness", "contrast", "depth_noise", "lost_view", "card"]
+)
 def test_negative_strengths_are_refused_by_name(name: str) -> None:
     with pytest.raises(ValueError, match=rf"augment\.{name}=-1"):
         AugmentConfig(**{name: -1 if name == "pixels" else -1.0})

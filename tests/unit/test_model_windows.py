@@ -208,3 +208,28 @@ def test_a_lost_view_is_black_and_without_depth_in_all_steps_of_its_window() -> 
     counts = torch.cat(lost).float().sum(dim=0)
     assert (counts > 0).all()
     assert 0.3 < counts.sum() / (31 * B) < 0.7
+
+
+def test_a_card_hides_one_rectangle_of_one_view_in_all_steps_of_its_window() -> None:
+    window = read_window(window_batch(), CAMERAS)
+    owner, shares = window.real.nonzero()[:, 0], []
+    torch.manual_seed(0)
+    for _ in range(31):
+        covered = window.distorted(replace(STILL, card=0.5))
+        hidden = (covered.rgb != window.rgb).any(dim=2)
+        assert covered.depth[~hidden].equal(window.depth[~hidden])
+        for b in range(B):
+            rows = hidden[owner == b]
+            assert rows.equal(rows[:1].expand_as(rows))
+            views = rows[0].flatten(1).any(dim=1)
+            assert views.sum() <= 1
+            for view in views.nonzero()[:, 0]:
+                y, x = rows[0, view].any(dim=1), rows[0, view].any(dim=0)
+                assert rows[0, view].equal(y[:, None] & x)
+                shares.append(rows[0, view].float().mean().item())
+                depth = covered.depth[owner == b][:, view][rows[:, view]]
+                assert depth.unique().numel() == 1
+                assert depth[0] == 0 or 0.1 <= depth[0] <= 0.4
+    assert 0.3 < len(shares) / (31 * B) < 0.7
+    assert min(shares) < 0.2
+    assert max(shares) > 0.7
