@@ -13,6 +13,8 @@ from lerobot_histmv.model.config import DecoderConfig
 from lerobot_histmv.model.layers import ConvBlock, full_precision, group_norm, resize_bilinear, upsample_to
 
 TEMPERATURE = 0.1
+LEAST_WEIGHT = 1e-6
+"""A view's weight counts as at least so much: its logarithm stays finite."""
 LOCAL_CHANNELS = 24
 """Channels of the decoded map at stride 4."""
 PEAK_REACH = 0.05
@@ -200,15 +202,19 @@ class Decoder(nn.Module):
         cloud: Float[Tensor, "n k 3 y x"],
         valid: Bool[Tensor, "n k y x"],
         eyes: Float[Tensor, "n k 3"],
+        weights: Float[Tensor, "n k"],
     ) -> tuple[Prediction, Float[Tensor, "n k"]]:
         """Decode all views of each step with one softmax over the pixels of all; also each view's share of the heat.
 
-        The views' pixels lie one below the other, as in a single tall image. Where the second decoder needs one view,
-        it gets the mean of all, weighted by their shares. Arguments as in ``forward``, of every view.
+        The views' pixels lie one below the other, as in a single tall image. The view weights w are the prior of the
+        views: a pixel's heat is proportional to w exp(logit / T). Where the second decoder needs one view, it gets the
+        mean of all, weighted by their shares. Arguments as in ``forward``, of every view.
         """
         k = maps.shape[1]
         size = (cloud.shape[-2], cloud.shape[-1])
         logits, decoded = self.position(maps.flatten(0, 1), skips, size)
+        prior = TEMPERATURE * weights.clamp_min(LEAST_WEIGHT).log()
+        logits = logits + rearrange(prior, "n k -> (n k) 1 1")
         place = self._locate(
             rearrange(logits, "(n k) y x -> n (k y) x", k=k),
             rearrange(cloud, "n k c y x -> n c (k y) x"),

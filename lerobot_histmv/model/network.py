@@ -203,7 +203,13 @@ class HistMVNet(nn.Module):
         own = rearrange(enriched, "n d (k h) w -> n k d h w", h=h)  # k is 1 for a map that all views share
         maps = own.expand_as(encoding.features)
         predicted, shares = self.decoder.together(
-            maps, encoding.features, encoding.skips, encoding.cloud, encoding.valid, encoding.eyes
+            maps,
+            encoding.features,
+            encoding.skips,
+            encoding.cloud,
+            encoding.valid,
+            encoding.eyes,
+            encoding.weights,
         )
         steps = torch.arange(len(shares), device=shares.device)
         return predicted, torch.stack([steps, most_informative(shares)], dim=-1)

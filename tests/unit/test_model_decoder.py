@@ -168,3 +168,17 @@ def test_decoders_use_history_view_and_every_skip(name: str) -> None:
     found = decode(decoder(), given)
     (found.position.square().sum() + found.gripper.sum()).backward()
     assert all(leaf.grad.abs().sum() > 0 for leaf in leaves)
+
+
+def test_one_softmax_over_all_views_has_their_weights_as_prior() -> None:
+    given, module = inputs(), decoder()
+    skips = given.pop("skips")
+    maps, views, cloud, valid, eyes = (given[name][None] for name in ("maps", "view", "cloud", "valid", "eye"))
+    even, uneven = torch.full((1, M), 1 / M), torch.tensor([[0.7, 0.25, 0.05]])
+    before, after = (
+        module.together(maps, views, skips, cloud, valid, eyes, weights)[0].log_heat.unflatten(1, (M, Y))[0]
+        for weights in (even, uneven)
+    )
+    ratio = (after - before)[valid[0]].exp() / (uneven / even)[0].repeat_interleave(valid[0].sum(dim=(1, 2)))
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), atol=0, rtol=1e-3)
+    torch.testing.assert_close(after.exp().sum(), torch.tensor(1.0))
