@@ -52,7 +52,7 @@ class PushButtons(ColorTask):
     | success | exactly the named buttons were pressed by 3 mm, in order (RLBench forgives other buttons, |
     | | so that pressing all of them again and again would do) |
     | failure | wrong object: another button, or a named one out of turn, was pressed |
-    | macro steps | 2 for the first button: above, push; 3 for each other: up again, above, push |
+    | macro steps | 2, 5, 8: above, push; up again and the same over the next |
     | difficulty | what was pressed does not show, and the arm is over a button twice, before its push and after: |
     | | only the past tells whether to push or to go on |
 
