@@ -30,7 +30,7 @@ EPISODES_FILES = "meta/episodes/chunk-*/file-*.parquet"
 
 @dataclass(frozen=True)
 class MergePieces:
-    """The last task of the engine; its memory does not grow with the number of episodes.
+    """The last task of the engine; it holds one piece at a time, and some kilobytes of LeRobot's per episode.
 
     Attributes:
         config: options of the whole dataset.
