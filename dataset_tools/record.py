@@ -32,7 +32,7 @@ class RecordEnvConfig:
     type: str = "ur5"
     # What to demonstrate: a task (turn_tap), a variation (turn_tap.left), a suite (set1), or several joined by commas.
     task: str = ""
-    # Index of the variation to record; by default each episode's seed draws one.
+    # Index of the variation to record; by default all take turns, in random order.
     variation: int | None = None
     # Cameras to record, in this order: a list such as [front,wrist].
     cameras: list[str] = field(default_factory=lambda: list(CAMERA_NAMES))
@@ -47,7 +47,7 @@ class RecordConfig:
     """Record successful demonstrations."""
 
     env: RecordEnvConfig = field(default_factory=RecordEnvConfig)
-    # Successful episodes of every task that is named; their seeds draw the variations.
+    # Successful episodes of every task that is named; its variations take turns.
     episodes: int = 50
     # Instead: successful episodes of every variation of every task that is named.
     episodes_per_variation: int | None = None

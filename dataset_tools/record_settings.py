@@ -19,7 +19,7 @@ class RecordSettings:
 
     Args:
         tasks: names of the tasks; every one gets as many episodes.
-        variation: the one to record; None: each seed draws its own.
+        variation: the one to record; None: all of them in turn.
         cameras: names, in the order of the calibration vectors.
         image_size: side of the images [pixels].
         fps: frames per second; divides ``CONTROL_RATE``.

@@ -40,6 +40,15 @@ class WorkerSetup:
     seed: int
 
 
+def dealt(variations: Sequence[int], seed: int, turn: int) -> int:
+    """The variation of a task's attempt number ``turn``: all come once, in random order, before one comes again.
+
+    If every attempt drew its own, ten demonstrations of six colours would often lack three of them.
+    """
+    deck, place = divmod(turn, len(variations))
+    return variations[np.random.default_rng((seed, deck)).permutation(len(variations))[place]]
+
+
 class Worker:
     """Makes attempts with one environment, which lives until an attempt at another task."""
 
@@ -60,7 +69,8 @@ class Worker:
         setup, seed = self.setup, self.setup.seed + attempt
         task = setup.tasks[attempt % len(setup.tasks)]
         env = self.env(task)
-        _, info = env.reset(seed=seed)
+        variation = dealt(env.variations, setup.seed, attempt // len(setup.tasks))
+        _, info = env.reset(seed=seed, options={"variation": variation})
         demonstration = Demonstration(env, setup.cameras, setup.stride)
         failure = demonstration.run()
         outcome = Outcome(

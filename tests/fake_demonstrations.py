@@ -44,10 +44,14 @@ class FakeEnv:
     def close(self) -> None:
         pass
 
-    def reset(self, *, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    @property
+    def variations(self) -> range:
+        return range(len(PARAPHRASES))
+
+    def reset(self, *, seed: int, options: dict[str, int] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         self.seed, self.ticks = seed, 0
         rng = np.random.default_rng(seed)
-        self.variation = int(rng.integers(len(PARAPHRASES)))
+        self.variation = (options or {}).get("variation", 0)
         instruction = self.paraphrases[int(rng.integers(len(self.paraphrases)))]
         return self.observe(), {"variation": self.variation, "instruction": instruction}
 

@@ -142,11 +142,14 @@ class UR5Env(gymnasium.Env[Observation, Float[np.ndarray, " 8"]]):
         return self.task_class.instructions(self.variation, self.instruction_split)
 
     @property
+    def variations(self) -> Sequence[int]:
+        """Variations of which an episode's seed draws one."""
+        return range(len(self.task_class.variations)) if self._fixed_variation is None else (self._fixed_variation,)
+
+    @property
     def _max_episode_steps(self) -> int:
         """Most steps of any episode; LeRobot's evaluation reads it."""
-        fixed = self._fixed_variation
-        variations = range(len(self.task_class.variations)) if fixed is None else [fixed]
-        return max(self._step_limit(variation) for variation in variations)
+        return max(self._step_limit(variation) for variation in self.variations)
 
     def _step_limit(self, variation: int) -> int:
         limit = 2 * self.task_class.macro_steps(variation)

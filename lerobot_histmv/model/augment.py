@@ -30,8 +30,8 @@ class AugmentConfig:
     brightness: float = 0.06
     contrast: float = 0.1
     depth_noise: float = 0.0
-    lost_view: float = 0.0
-    card: float = 0.0
+    lost_view: float = 0.2
+    card: float = 0.2
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -114,8 +114,8 @@ class ViewConfig:
     Args:
         fusion: what history sees of a step: "attention" (the views' sum weighted by w), "mean" (the mean of the views
             that show something) or "tokens" (every view's tokens, as in Hiveformer). Only "attention" has w and L_MI.
-        decode: "one" (the heat map lies over one view) or "all" (one softmax over the pixels of all views, for which w
-            is the views' prior).
+        decode: "one" (the heat map lies over one view, as in the paper) or "all" (one softmax over the pixels of all
+            views, for which w is the views' prior).
         act: with decode="one", which view acts: the one of largest "weight" (as printed), or of largest weight times
             "certainty".
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
@@ -125,7 +125,7 @@ class ViewConfig:
     """
 
     fusion: str = "attention"
-    decode: str = "one"
+    decode: str = "all"
     act: str = "certainty"
     mi_loss: str = "nmi"
     mi_dims: int = 8

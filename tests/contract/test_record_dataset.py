@@ -15,7 +15,7 @@ from lerobot.datasets.io_utils import load_stats
 from dataset_tools.assembly import assemble
 from dataset_tools.dense_features import ROBOT_TYPE, dense_features
 from dataset_tools.images import image_statistics
-from dataset_tools.record_worker import Demonstration, Worker, WorkerSetup
+from dataset_tools.record_worker import Demonstration, Worker, WorkerSetup, dealt
 from dataset_tools.shards import Outcome
 from lerobot_histmv import keys
 
@@ -125,6 +125,22 @@ def test_a_frame_commands_what_holds_at_its_end(stride: int, expected: list[int]
     for frame, tick in enumerate(range(0, 10, stride)):
         env.ticks = tick
         assert np.array_equal(columns[keys.STATE][frame], env.observe()["agent_pos"])
+
+
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("seed", [0, 7])
+def test_variations_take_turns_in_random_order(count: int, seed: int) -> None:
+    variations = range(3, 3 + count)
+    rounds = [[dealt(variations, seed, count * n + place) for place in range(count)] for n in range(11)]
+    assert all(sorted(one) == list(variations) for one in rounds)
+    assert count == 1 or len({tuple(one) for one in rounds}) > 5
+
+
+def test_every_task_of_several_deals_its_own_variations(tmp_path: Path) -> None:
+    worker = Worker(WorkerSetup(tmp_path, ("lift", "push", "pull"), FakeEnv, CAMERAS, stride=1, seed=0))
+    outcomes = [worker.make_attempt(attempt) for attempt in range(3 * len(PARAPHRASES))]
+    for task in worker.setup.tasks:
+        assert sorted(one.variation for one in outcomes if one.task == task) == list(range(len(PARAPHRASES)))
 
 
 def test_failed_attempts_leave_only_their_reason(tmp_path: Path) -> None:
