@@ -14,7 +14,7 @@ from lerobot_histmv.modeling_histmv import HistMVPolicy
 CAMERAS = ["front", "wrist"]
 STATE_SIZE = 14
 TASK = "pick up the red cube"
-STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0)
+STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0, lost_view=0.0, card=0.0)
 """No augmentation."""
 
 

@@ -81,7 +81,7 @@ def _views(board: Image.Image, draw: ImageDraw.ImageDraw, record: Record, truth:
         draw.text((left, 0), f"{camera}{': acts' if chosen else ''}", font=font(14), fill=color)
         board.paste(tile(record, index, side, truth), (left, LINE + 2))
         top = LINE + 2 + side + GAP
-        for name, share in (("weight", record.weights[index]), ("certainty", record.certainties[index])):
+        for name, share in (("weight", record.weights[index]), (record.choosing.support, record.support[index])):
             _bar(draw, (left, top), side, name, float(share), color if chosen else MUTED)
             top += LINE
         draw.text((left, top - 1), _alone(record, index, truth), font=font(13), fill=MUTED)
@@ -90,11 +90,9 @@ def _views(board: Image.Image, draw: ImageDraw.ImageDraw, record: Record, truth:
 
 def _alone(record: Record, index: int, truth: Float[np.ndarray, " 8"] | None) -> str:
     """How far off the true position a view would have sent the tool by itself, or how far from where it was sent."""
-    aim = record.targets[record.chosen] if truth is None else truth[:3]
-    distance = f"{100 * np.linalg.norm(record.targets[index] - aim):.1f} cm"
-    if truth is None:
-        return "" if index == record.chosen else f"alone: {distance} elsewhere"
-    return f"alone: {distance} off"
+    aim = record.action[:3] if truth is None else truth[:3]
+    distance = 100 * np.linalg.norm(record.targets[index] - aim)
+    return f"alone: {distance:.1f} cm {'elsewhere' if truth is None else 'off'}"
 
 
 def _bar(draw: ImageDraw.ImageDraw, place: tuple[int, int], side: int, name: str, share: float, color: Color) -> None:

@@ -13,10 +13,10 @@ from dataset_tools.page import Chapter, Exhibit, Panel
 
 FILM = (
     "The film",
-    "Right, at every decision: each view under its heat map (bright: there). The framed view acted: weight times "
-    "certainty is largest there; each view also says where it alone would have sent the tool. The green cross is where "
-    "the tool is sent, a white ring where the demonstration went. Below, the steps in memory with the attention that "
-    "each got, and how far the target would move without it.",
+    "Right, at every decision: each view under its heat map (bright: there). The framed view acted: it has most of the "
+    "common heat, or the largest weight times certainty; each view also says where it alone would have sent the tool. "
+    "The green cross is where the tool is sent, a white ring where the demonstration went. Below, the steps in memory "
+    "with the attention that each got, and how far the target would move without it.",
 )
 FAR = 0.05
 """A decision this far off the true position [m] went wrong."""
@@ -97,11 +97,11 @@ def notes(episode: Explained) -> list[str]:
         return []
     off = np.linalg.norm(np.stack([one.targets for one in episode.records]) - episode.truth[:, None, :3], axis=2)
     found = []
-    for index, (errors, chosen) in enumerate(zip(off, episode.chosen, strict=True)):
+    for index, (errors, acted, chosen) in enumerate(zip(off, episode.errors, episode.chosen, strict=True)):
         best = int(errors.argmin())
-        if errors[chosen] > FAR and errors[best] < errors[chosen] / 2:
+        if acted > FAR and errors[best] < acted / 2:
             found.append(
-                f"decision {index + 1}: {episode.cameras[chosen]} acted, {100 * errors[chosen]:.0f} cm off; "
+                f"decision {index + 1}: {episode.cameras[chosen]} acted, {100 * acted:.0f} cm off; "
                 f"{episode.cameras[best]} alone would have been {100 * errors[best]:.0f} cm off"
             )
     return found
@@ -113,7 +113,7 @@ def decision_table(episode: Explained) -> str:
         "",
         "decision",
         "acts",
-        *(f"weight x certainty, {camera} [%]" for camera in episode.cameras),
+        *(f"weight, {episode.records[0].choosing.support}, {camera} [%]" for camera in episode.cameras),
         "without its past, elsewhere by [cm]",
     ]
     rows = "".join(
@@ -127,7 +127,7 @@ def decision_table(episode: Explained) -> str:
 def _cells(episode: Explained, index: int) -> list[str]:
     record = episode.records[index]
     truth = None if episode.truth is None else episode.truth[index]
-    pairs = zip(record.weights, record.certainties, strict=True)
-    scores = [f"{100 * weight:.0f} x {100 * certainty:.0f}" for weight, certainty in pairs]
+    pairs = zip(record.weights, record.support, strict=True)
+    scores = [f"{100 * weight:.0f}, {100 * support:.0f}" for weight, support in pairs]
     text = decision_text(record, truth)
     return [str(index + 1), text, episode.cameras[record.chosen], *scores, f"{100 * record.memory:.1f}"]

@@ -105,11 +105,10 @@ def explainer(config: ExplainConfig) -> Callable[[Path], Explained]:
     policy = load_config(config.policy)
     if not isinstance(policy, HistMVConfig):
         raise ValueError(f"{config.policy.path} is a policy of type {policy.type}; explain looks inside histmv ones")
-    views = policy.network.views
-    if (views.decode, views.act) != ("one", "certainty"):
+    if policy.network.views.fusion != "attention":
         raise ValueError(
-            f"{config.policy.path} has views.decode={views.decode!r} and views.act={views.act!r}; explain compares "
-            "what each view alone would have done, which only views.decode='one' with views.act='certainty' computes"
+            f"{config.policy.path} has views.fusion={policy.network.views.fusion!r}; explain shows how the views were "
+            "weighed, which only views.fusion='attention' does"
         )
     if config.env is not None:
         check_fits(policy, config.env)

@@ -40,9 +40,9 @@ class Explained:
         return np.stack([one.weights for one in self.records])
 
     @cached_property
-    def certainties(self) -> Float[np.ndarray, "n k"]:
-        """How certain each view's heat map is."""
-        return np.stack([one.certainties for one in self.records])
+    def scores(self) -> Float[np.ndarray, "n k"]:
+        """What the acting view has most of."""
+        return np.stack([one.scores for one in self.records])
 
     @cached_property
     def chosen(self) -> Int[np.ndarray, " n"]:

@@ -45,7 +45,7 @@ def draw_weights(episode: Explained) -> Figure:
         axes.spines[:].set(visible=True, linewidth=4, color=color_of(record.chosen))
     weights, scores = below.subplots(1, 2, sharex=True)
     _lines(weights, episode, episode.weights, "view weight")
-    _lines(scores, episode, episode.weights * episode.certainties, "weight x certainty: the largest acts")
+    _lines(scores, episode, episode.scores, f"{episode.records[0].choosing.score}: the largest acts")
     handles = [
         Line2D([], [], color=color_of(index), linewidth=2.5, label=camera)
         for index, camera in enumerate(episode.cameras)

@@ -1,29 +1,50 @@
 """What a policy computed while it acted: one record per decision, from hooks on its modules.
 
-The policy runs as it always does. Its modules' inputs and outputs are noted; what it never makes explicit (attention
-weights, information shared between views, what it would have done without a past step) is computed from them.
+The policy runs as it always does. What goes into its modules and comes out is noted; what it never makes explicit
+(attention weights, information shared between views, what each view alone or no past would have led to) is computed
+from that.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from dataset_tools.explain.attention import attention_weights, forgotten, step_shares
 from dataset_tools.inspect.cameras import CameraView
-from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.config import ViewConfig
+from lerobot_histmv.model.decoder import Prediction, around_peak
 from lerobot_histmv.model.history import SelfAttentionBlock
 from lerobot_histmv.model.layers import full_precision
-from lerobot_histmv.model.network import HistMVNet
-from lerobot_histmv.model.view_attention import normalised_mutual_information
+from lerobot_histmv.model.network import Encoding, HistMVNet
+from lerobot_histmv.model.view_attention import choose_views, normalised_mutual_information
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 from lerobot_histmv.windows import read_window
+
+
+@dataclass(frozen=True)
+class Choosing:
+    """In words, how a policy chooses the view that acts.
+
+    Args:
+        support: what speaks for a view beside its weight.
+        score: what the acting view has most of.
+    """
+
+    support: str
+    score: str
+
+    @classmethod
+    def of(cls, views: ViewConfig) -> "Choosing":
+        """With one common heat map, the view that holds most of it acts."""
+        if views.decode == "all":
+            return cls("heat", "share of the heat")
+        return cls("certainty", "weight" if views.act == "weight" else "weight x certainty")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +56,14 @@ class Record:
     Attributes:
         views: what each of the k cameras saw, in the policy's order.
         tool: measured tool position [m].
+        choosing: what ``support`` and ``scores`` are.
         weights: view weights w, sum to 1.
-        certainties: share of each view's heat near its peak.
-        chosen: index of the view that acted, the one with the largest product of weight and certainty.
-        heat: heat map over every view's pixels, each sums to 1; 0 on pixels without depth.
-        targets: where each view alone would have sent the tool [m]; the chosen one's is the action's, before it is
-            limited to the workspace.
+        support: with views.decode="one" the share of each view's heat near its peak, with "all" the share of the common
+            heat near its peak that lies in each view.
+        scores: what the acting view has most of.
+        chosen: index of the view that acted.
+        heat: heat map of every view by itself, each sums to 1; 0 on pixels without depth.
+        targets: where each view alone would have sent the tool [m].
         information: normalised mutual information between the views, in [0, 1], diagonal 1.
         attention: share of each step in what this step took, per layer of the history transformer; rows sum to 1.
         influence: how far the target would have moved without each past step [m], none for this step itself.
@@ -52,8 +75,10 @@ class Record:
 
     views: Mapping[str, CameraView]
     tool: Float[np.ndarray, " 3"]
+    choosing: Choosing
     weights: Float[np.ndarray, " k"]
-    certainties: Float[np.ndarray, " k"]
+    support: Float[np.ndarray, " k"]
+    scores: Float[np.ndarray, " k"]
     chosen: int
     heat: Float[np.ndarray, "k y x"]
     targets: Float[np.ndarray, "k 3"]
@@ -66,39 +91,51 @@ class Record:
     action: Float[np.ndarray, " 8"]
 
 
-@dataclass(frozen=True)
-class Call:
-    """One call of a module."""
+@dataclass
+class Notes:
+    """What a decision left behind: inputs of the history transformer and of its layers, the encoding, the outcome."""
 
-    inputs: tuple[Any, ...]
-    output: Any
-
-
-Calls = dict[str, list[Call]]
+    history: tuple[Any, ...] = ()
+    layers: list[tuple[Any, ...]] = field(default_factory=list)
+    encoding: Encoding | None = None
+    enriched: Float[Tensor, "1 d h w"] | None = None
+    outcome: tuple[Prediction, Int[Tensor, "1 2"]] | None = None
 
 
 @contextmanager
 def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
     """A list to which every ``select_action`` adds its record while this lasts; batches must hold one environment."""
-    net, records = policy.net, list[Record]()
-    calls: Calls = {}
-    modules: dict[str, Iterable[nn.Module]] = {
-        "views": [net.view_attention],
-        "history": [net.history],
-        "layers": net.history.layers,
-        "decoder": [net.decoder],
-    }
-    handles = [
-        module.register_forward_hook(partial(_note, calls, name)) for name, group in modules.items() for module in group
-    ]
+    net, records, notes = policy.net, list[Record](), Notes()
     act: Callable[..., Float[Tensor, "1 8"]] = policy.select_action
+    decode_best = net.decode_best
+
+    def note_history(_: Any, inputs: tuple[Any, ...], __: Any) -> None:
+        notes.history = inputs
+
+    def note_layer(_: Any, inputs: tuple[Any, ...], __: Any) -> None:
+        notes.layers.append(inputs)
+
+    def note_decoding(encoding: Encoding, enriched: Tensor) -> tuple[Prediction, Tensor]:
+        notes.encoding, notes.enriched, notes.outcome = encoding, enriched, decode_best(encoding, enriched)
+        return notes.outcome
+
+    @contextmanager
+    def noted() -> Iterator[None]:
+        handles = [net.history.register_forward_hook(note_history)]
+        handles += [layer.register_forward_hook(note_layer) for layer in net.history.layers]
+        net.decode_best = note_decoding  # type: ignore[method-assign]
+        notes.layers = []
+        try:
+            yield
+        finally:
+            del net.decode_best
+            for handle in handles:
+                handle.remove()
 
     def select_action(batch: dict[str, Any], **options: Any) -> Float[Tensor, "1 8"]:
-        calls.clear()
-        action = act(batch, **options)
-        noted = dict(calls)
-        calls.clear()  # what is computed from the noted calls runs the modules again
-        records.append(record(policy, batch, action, noted))
+        with noted():
+            action = act(batch, **options)
+        records.append(record(policy, batch, action, notes))
         return action
 
     policy.select_action = select_action  # type: ignore[method-assign]
@@ -106,68 +143,63 @@ def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
         yield records
     finally:
         del policy.select_action
-        for handle in handles:
-            handle.remove()
-
-
-def _note(calls: Calls, name: str, _: Any, inputs: tuple[Any, ...], output: Any) -> None:
-    calls.setdefault(name, []).append(Call(inputs, output))
 
 
 @torch.no_grad()
-def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1 8"], calls: Calls) -> Record:
-    """The record of a decision that ``calls`` noted."""
-    (views,), (history,), (decoder,) = calls["views"], calls["history"], calls["decoder"]
-    maps, weights, predicted = views.inputs[0], views.output, decoder.output
-    projection = policy.net.view_attention.get_buffer("projection")  # there, as one view is decoded
-    with full_precision(maps):
-        information = normalised_mutual_information(maps.float(), projection)
-    steps = history.inputs[0].shape[1]
+def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1 8"], notes: Notes) -> Record:
+    """The record of a decision that ``notes`` are of."""
+    net, encoding, views = policy.net, notes.encoding, policy.config.network.views
+    assert encoding is not None and notes.enriched is not None and notes.outcome is not None
+    weights = encoding.weights
+    alone = net.decode(encoding, notes.enriched, choose_views(weights, "expected")[0])
+    choosing, support = Choosing.of(views), alone.certainty
+    if views.decode == "all":
+        together = notes.outcome[0].log_heat.exp()
+        if net.config.decoder.peak:
+            together, _ = around_peak(together, net.heat_cloud(encoding, notes.outcome[1]))
+        support = together.view_as(alone.log_heat).sum(dim=(-2, -1))
+    scores = {"weight": weights[0], "weight x certainty": weights[0] * support}.get(choosing.score, support)
+    with full_precision(encoding.maps):
+        projection = net.view_attention.get_buffer("projection")  # there, as view attention is on
+        information = normalised_mutual_information(encoding.maps.float(), projection)
+    steps = notes.history[0].shape[1]
     attention = [
-        step_shares(attention_weights(layer, *call.inputs), steps)[0, -1]
-        for layer, call in zip(policy.net.history.layers, calls["layers"], strict=True)
+        step_shares(attention_weights(layer, *inputs), steps)[0, -1]
+        for layer, inputs in zip(net.history.layers, notes.layers, strict=True)
         if isinstance(layer, SelfAttentionBlock)
     ]
-    past, chosen = range(steps - 1), _best(weights, predicted)
-    memory, opening = _without(policy.net, calls, past)
+    past = range(steps - 1)
+    memory, opening = _without(net, notes, past)
     return Record(
         views=_camera_views(policy, batch),
         tool=_array(read_window(batch, policy.config.cameras).tool[0]),
+        choosing=choosing,
         weights=_array(weights[0]),
-        certainties=_array(predicted.certainty),
-        chosen=chosen,
-        heat=_array(predicted.log_heat.exp()),
-        targets=_array(predicted.position),
+        support=_array(support),
+        scores=_array(scores),
+        chosen=int(notes.outcome[1][0, 1]),
+        heat=_array(alone.log_heat.exp()),
+        targets=_array(alone.position),
         information=_array(information[0]),
         attention=_array(torch.stack(attention)),
-        influence=np.array([_without(policy.net, calls, [step])[0] for step in past]),
+        influence=np.array([_without(net, notes, [step])[0] for step in past]),
         memory=memory,
-        opening=_opening(predicted, chosen),
+        opening=float(notes.outcome[0].gripper.sigmoid()),
         opening_without_past=opening,
         action=_array(action[0]),
     )
 
 
-def _best(weights: Float[Tensor, "1 k"], predicted: Prediction) -> int:
-    return int((weights[0] * predicted.certainty).argmax())
-
-
-def _opening(predicted: Prediction, view: int) -> float:
-    return float(predicted.gripper[view].sigmoid())
-
-
-def _without(net: HistMVNet, calls: Calls, steps: Sequence[int]) -> tuple[float, float]:
+def _without(net: HistMVNet, notes: Notes, steps: Sequence[int]) -> tuple[float, float]:
     """How far the target moves [m], and the probability of "open", if the history does not see ``steps`` of its window.
 
     The cached steps themselves stay as they were encoded: what is hidden is hidden from the history transformer.
     """
-    (views,), (history,), (decoder,) = calls["views"], calls["history"], calls["decoder"]
-    with forgotten(net.history, steps, history.inputs[0].shape[1]):
-        enriched = net.history(*history.inputs)[:, -1]
-    predicted = net.decoder(enriched.expand_as(decoder.inputs[0]), *decoder.inputs[1:])
-    best = _best(views.output, predicted)
-    before = decoder.output.position[_best(views.output, decoder.output)]
-    return float((predicted.position[best] - before).norm()), _opening(predicted, best)
+    assert notes.encoding is not None and notes.outcome is not None
+    with forgotten(net.history, steps, notes.history[0].shape[1]):
+        enriched = net.history(*notes.history)[:, -1]
+    predicted, _ = net.decode_best(notes.encoding, enriched)
+    return float((predicted.position - notes.outcome[0].position).norm()), float(predicted.gripper.sigmoid())
 
 
 def _camera_views(policy: HistMVPolicy, batch: dict[str, Any]) -> dict[str, CameraView]:

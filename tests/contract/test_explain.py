@@ -15,6 +15,7 @@ from helpers import episodes
 from PIL import Image
 from tiny_dataset import write_dataset
 from tiny_policy import TASK, episode, observation, tiny_config, tiny_policy, window
+from tiny_scene import tiny_network
 
 from dataset_tools.cli import main
 from dataset_tools.eval_checkpoint import PolicySource
@@ -26,6 +27,7 @@ from dataset_tools.explain.episode import Explained
 from dataset_tools.explain.watch import Record, watched
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import project
+from lerobot_histmv.model.config import ViewConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 from lerobot_histmv.windows import read_window
 
@@ -33,9 +35,17 @@ STEPS, PAST_STEPS, LENGTHS = 7, 2, (3, 5)
 REPO = "local/tiny"
 
 
-@pytest.fixture(scope="module")
-def policy() -> HistMVPolicy:
-    return tiny_policy(tiny_config(past_steps=STEPS - 1))
+CHOOSING = {
+    "share of the heat": ViewConfig(),
+    "weight x certainty": ViewConfig(decode="one"),
+    "weight": ViewConfig(decode="one", act="weight"),
+}
+
+
+@pytest.fixture(scope="module", params=CHOOSING)
+def policy(request: pytest.FixtureRequest) -> HistMVPolicy:
+    network = tiny_network(past_steps=STEPS - 1, views=CHOOSING[request.param])
+    return tiny_policy(tiny_config(network=network))
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +79,12 @@ def test_records_hold_what_the_policy_decided(policy: HistMVPolicy) -> None:
             np.testing.assert_array_equal(record.action, action[0])
             np.testing.assert_array_equal(record.weights, decision.weights[0])
             assert record.chosen == decision.view[0]
-            np.testing.assert_array_equal(record.heat[record.chosen], decision.heat[0])
+            together = policy.config.network.views.decode == "all"
+            heat = decision.heat[0].numpy()
+            np.testing.assert_allclose(record.heat[record.chosen], heat / heat.sum(), rtol=1e-4, atol=1e-9)
             workspace = policy.net.workspace
             limited = np.clip(record.targets[record.chosen], workspace.low.numpy(), workspace.high.numpy())
-            np.testing.assert_array_equal(record.action[:3], limited)
+            assert together or record.action[:3] == pytest.approx(limited, abs=1e-6)
             assert (record.opening > 0.5) == bool(action[0, 7])
             np.testing.assert_allclose(record.tool, rows[keys.STATE][step, :3])
 
@@ -80,7 +92,14 @@ def test_records_hold_what_the_policy_decided(policy: HistMVPolicy) -> None:
 def test_shares_are_shares(acted: tuple[torch.Tensor, list[Record]]) -> None:
     for step, record in enumerate(acted[1]):
         assert record.weights.sum() == pytest.approx(1, abs=1e-6)
-        assert record.chosen == (record.weights * record.certainties).argmax()
+        assert record.chosen == record.scores.argmax()
+        expected = {
+            "share of the heat": record.support,
+            "weight x certainty": record.weights * record.support,
+            "weight": record.weights,
+        }
+        np.testing.assert_allclose(record.scores, expected[record.choosing.score])
+        assert record.choosing.support == "certainty" or record.support.sum() == pytest.approx(1, abs=1e-5)
         np.testing.assert_allclose(record.heat.sum(axis=(1, 2)), 1, atol=1e-5)
         assert record.attention.shape == (2, step + 1)
         np.testing.assert_allclose(record.attention.sum(axis=1), 1, atol=1e-5)

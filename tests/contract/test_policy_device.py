@@ -24,7 +24,7 @@ def networks(folder: Path) -> dict[str, NetworkConfig]:
     torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
     return {
         "ranked": tiny_network(),
-        "sampled": tiny_network(views=ViewConfig(train_choice="sampled")),
+        "sampled": tiny_network(views=ViewConfig(decode="one", train_choice="sampled")),
         "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
     }
 

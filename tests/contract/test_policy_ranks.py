@@ -27,7 +27,7 @@ INSTRUCTIONS = {TASK: [TASK], "press the button": ["press the button", "push the
 
 
 def policy_without_chance(choice: str) -> HistMVPolicy:
-    network = tiny_network(views=ViewConfig(train_choice=choice))
+    network = tiny_network(views=ViewConfig(decode="one", train_choice=choice))
     policy = tiny_policy(tiny_config(network=network, instructions=INSTRUCTIONS)).train()
     policy.net.points.eval()
     return policy

@@ -23,7 +23,7 @@ def training_batch() -> dict[str, Any]:
 
 @pytest.mark.parametrize("choice", ["ranked", "expected", "argmax", "sampled"])
 def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) -> None:
-    policy = tiny_policy(tiny_config(network=tiny_network(views=ViewConfig(train_choice=choice)))).train()
+    policy = tiny_policy(tiny_config(network=tiny_network(views=ViewConfig(decode="one", train_choice=choice)))).train()
     loss, log = policy(training_batch())
     loss.backward()
     assert loss.shape == ()
@@ -194,7 +194,7 @@ def test_policy_without_recorded_wordings_trains() -> None:
 
 @pytest.mark.parametrize("choice", ["ranked", "sampled"])
 def test_views_are_judged_by_their_actions_not_by_heat_maps_that_a_blind_view_lacks(choice: str) -> None:
-    network = tiny_network(views=ViewConfig(train_choice=choice))
+    network = tiny_network(views=ViewConfig(decode="one", train_choice=choice))
     terms = []
     for heatmap in (0.0, 7.0):
         policy = tiny_policy(tiny_config(network=network, loss=LossConfig(heatmap=heatmap))).train()

@@ -45,7 +45,7 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDataset:
     dataset = LeRobotDataset.create(REPO_ID, FPS, FEATURES, root=root, robot_type=ROBOT_TYPE, use_videos=False)
     env = FakeEnv()
     for seed in SEEDS:
-        _, info = env.reset(seed=seed)
+        _, info = env.reset(seed=seed, options={"variation": dealt(env.variations, SEEDS[0], turn=seed)})
         demonstration = Demonstration(env, CAMERAS, stride=1)
         assert demonstration.run() == ""
         for frame, action in zip(demonstration.frames, demonstration.actions, strict=True):

@@ -41,7 +41,10 @@ VARIANTS = (
     | COLOURS
     | {
         "peer": COLOURS["convolutions only"] | {"views": TOGETHER["tokens"], "points": NO_POINTS},
-        "as printed": {"decoder": DecoderConfig(ray=False, local=False, peak=False), "views": ViewConfig(act="weight")},
+        "as printed": {
+            "decoder": DecoderConfig(ray=False, local=False, peak=False),
+            "views": ViewConfig(decode="one", act="weight"),
+        },
         "no history": {"history": HistoryConfig(enabled=False, layers=2, heads=2)},
     }
 )
@@ -106,7 +109,7 @@ def test_all_ways_of_fusing_and_decoding_agree_on_a_single_view(fusion: str) -> 
 
 
 def test_one_softmax_over_all_views_is_that_of_the_only_view_that_shows_anything() -> None:
-    net = tiny_net(points=NO_POINTS)
+    net = tiny_net(points=NO_POINTS, views=ViewConfig(decode="one"))
     seen = scene(net)
     seen = replace(seen, depth=seen.depth * torch.tensor([0.0, 1.0, 0.0])[:, None, None])
     together = same_weights(net, points=NO_POINTS, views=TOGETHER["attention"])
@@ -140,7 +143,7 @@ def test_tokens_of_every_view_are_kept_but_for_one_that_shows_nothing() -> None:
 
 
 def test_the_view_of_largest_weight_acts_where_certainty_is_not_asked() -> None:
-    net = tiny_net(views=ViewConfig(act="weight"))
+    net = tiny_net(views=ViewConfig(decode="one", act="weight"))
     weights, _, view = decide(net, tiny_observation(7, 3, net.semantics.text_width))
     assert view.equal(weights.argmax(dim=1))
 

@@ -21,7 +21,7 @@ WINDOWS = ((0, 5), (2, 6), (4, 5))
 """Rows of each window: up to the drawn one, the first four of the episode, and an episode of one row."""
 
 
-STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0)
+STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0, lost_view=0.0, card=0.0)
 
 
 def window_batch() -> dict[str, Any]:
