@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -22,15 +23,18 @@ from dataset_tools.replay import SOURCE_RECORDING_FILE
 from dataset_tools.report import Report
 from dataset_tools.workplace import Workplace
 from lerobot_histmv import keys
+from lerobot_histmv.data.memory import return_freed_memory
 
 EPISODES_FILE_MB = 1
 """Size at which a file of episodes' metadata is closed."""
+AT_ONCE = 20
+"""Datasets that are merged at once: each takes most of a megabyte, beside what a single one takes."""
 EPISODES_FILES = "meta/episodes/chunk-*/file-*.parquet"
 
 
 @dataclass(frozen=True)
 class MergePieces:
-    """The last task of the engine; it holds one piece at a time, and some kilobytes of LeRobot's per episode.
+    """The last task of the engine; its memory does not grow with the number of pieces.
 
     Attributes:
         config: options of the whole dataset.
@@ -84,9 +88,30 @@ class MergePieces:
 
 
 def aggregated(roots: Sequence[Path], repo_id: str, path: Path) -> None:
-    """LeRobot's aggregation, with the pieces' files of rows as they are.
+    """LeRobot's aggregation of any number of datasets into one at ``path``, in their order, in bounded memory.
 
-    To fill files up, LeRobot would read and write the last one again for every piece: memory grows with the file, to
+    LeRobot opens the metadata of all at once: more than ``AT_ONCE`` are merged in groups, and the groups again. Arrow's
+    own allocators would keep what they freed.
+    """
+    pa.set_memory_pool(pa.system_memory_pool())
+    with TemporaryDirectory(dir=path.parent) as scratch:
+        level = 0
+        while len(roots) > AT_ONCE:
+            groups = [roots[first : first + AT_ONCE] for first in range(0, len(roots), AT_ONCE)]
+            merged = [Path(scratch, f"{level}-{number}") for number in range(len(groups))]
+            for group, place in zip(groups, merged, strict=True):
+                aggregate_once(group, f"local/{place.name}", place)
+            if level:
+                for root in roots:
+                    shutil.rmtree(root)
+            roots, level = merged, level + 1
+        aggregate_once(roots, repo_id, path)
+
+
+def aggregate_once(roots: Sequence[Path], repo_id: str, path: Path) -> None:
+    """LeRobot's aggregation, with the datasets' files of rows as they are.
+
+    To fill files up, LeRobot would read and write the last one again for every dataset: memory grows with the file, to
     more than ten times its size for rows without images, and time with its square. The metadata of episodes are filled
     up whatever one asks for; small files keep that cheap.
     """
@@ -95,6 +120,7 @@ def aggregated(roots: Sequence[Path], repo_id: str, path: Path) -> None:
         aggregate.aggregate_datasets(names, repo_id, list(roots), path, concatenate_data=False)
     for file in path.glob(EPISODES_FILES):
         tell_place(file)
+    return_freed_memory()
 
 
 def tell_place(file: Path) -> None:

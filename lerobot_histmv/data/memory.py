@@ -1,4 +1,4 @@
-"""Keeps large blocks of memory in the process: fresh pages cost a CPU training step as much time as its arithmetic."""
+"""What the C library does with freed memory: fresh pages cost a CPU training step as much time as its arithmetic."""
 
 import ctypes
 import platform
@@ -20,3 +20,12 @@ def keep_freed_memory() -> bool:
         return False
     libc = ctypes.CDLL(None)
     return bool(libc.mallopt(M_MMAP_THRESHOLD, LARGEST_ON_HEAP) and libc.mallopt(M_TRIM_THRESHOLD, NEVER))
+
+
+def return_freed_memory() -> None:
+    """Let glibc give what is free back to the system; by itself it does so only at the heap's end.
+
+    Other C libraries have no such call: nothing changes there.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)

@@ -64,6 +64,15 @@ def test_pieces_give_what_one_run_gives(dense: Path, at_once: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["keys"]
 
 
+def test_pieces_merged_in_groups_of_groups_give_the_same(
+    dense: Path, at_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merge, "AT_ONCE", 2)  # seven pieces become four, two, one
+    cli.main(["keyframe-many", *arguments(dense, tmp_path / "keys"), f"--pieces={EPISODES}", "--workers=1"])
+    assert_same(tmp_path / "keys", at_once)
+    assert [path.name for path in tmp_path.iterdir()] == ["keys"]
+
+
 def test_episodes_tell_the_file_they_lie_in_when_there_are_several(
     dense: Path, at_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,9 @@ from lerobot_histmv.windows import Window
 
 N, K = 2, 3
 STRONG = AugmentConfig(yaw=1.0, shift=0.3, pixels=7, brightness=0.3, contrast=0.3, depth_noise=0.01)
-OFF = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0, lost_view=0.0, card=0.0, depth_noise=0.0)
+OFF = AugmentConfig(
+    yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0, lost_view=0.0, card=0.0, depth_noise=0.0
+)
 
 
 def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -29,7 +29,10 @@ from lerobot_histmv.model.network import HistMVNet
         (lambda: ViewConfig(fusion="sum"), r"views\.fusion='sum'.*'attention', 'mean', 'tokens'"),
         (lambda: ViewConfig(decode="some"), r"views\.decode='some'.*'one', 'all'"),
         (lambda: ViewConfig(act="luck"), r"views\.act='luck'.*'certainty', 'weight'"),
-        (lambda: ViewConfig(fusion="mean", decode="one"), r"views\.decode='one'.*views\.fusion='mean'.*views\.decode='all'"),
+        (
+            lambda: ViewConfig(fusion="mean", decode="one"),
+            r"views\.decode='one'.*views\.fusion='mean'.*views\.decode='all'",
+        ),
         (lambda: ViewConfig(fusion="tokens", decode="one"), r"views\.decode='one'.*views\.fusion='tokens'"),
         (lambda: TextureConfig(encoder="unet"), r"texture\.encoder='unet'.*'panet', 'backbone', 'none'"),
         (lambda: SemanticsConfig(image="dino"), r"semantics\.image='dino'.*'clip', 'r3m', 'none'"),
