@@ -34,8 +34,10 @@ SCENES: dict[str, tuple[str, ...]] = {
     "held_out": ("--env.instruction_split=held_out",),
     "dead_camera": ("--env.disturbances.dead_camera=1",),
     "occluder": ("--env.disturbances.occluder=2",),
+    "covered": ("--env.disturbances.occluder=3",),
 }
-"""Kinds of scenes; the same seeds in each, so that the rows of a table are paired."""
+"""Kinds of scenes; the same seeds in each, so that the rows of a table are paired. A card hides 60 or 90 % of the width
+of a camera's picture."""
 
 
 def options(kind: str, camera: str) -> tuple[str, ...]:
