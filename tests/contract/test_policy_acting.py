@@ -143,7 +143,8 @@ def test_last_decision_shows_heat_over_the_chosen_view(policy: HistMVPolicy) -> 
     act(policy, rows, 1)
     decision = policy.last_decision
     assert decision is not None
-    torch.testing.assert_close(decision.heat.sum(dim=(1, 2)), torch.ones(1))
+    heat = decision.heat.sum()
+    assert 1 / len(CAMERAS) <= heat <= 1 + 1e-6, "all views share one heat map, of which this one holds most"
     camera = CAMERAS[decision.view.item()]
     assert decision.heat[0][rows[keys.depth_key(camera)][0, 0] == 0].eq(0).all()
 

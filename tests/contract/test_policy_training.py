@@ -38,12 +38,15 @@ def test_loss_is_finite_and_every_trained_weight_gets_a_gradient(choice: str) ->
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_log_names_every_term_view_and_the_error_in_millimetres(training: bool) -> None:
-    policy = tiny_policy().train(training)
+@pytest.mark.parametrize("decode", ["all", "one"])
+def test_log_names_every_term_view_and_the_error_in_millimetres(training: bool, decode: str) -> None:
+    policy = tiny_policy(tiny_config(network=tiny_network(views=ViewConfig(decode=decode)))).train(training)
     loss, log = policy(training_batch())
     weights = term_weights(policy.config.loss)
     if not training:
-        del weights["choice"], weights["paraphrase"]
+        del weights["paraphrase"]
+    if not training or decode == "all":
+        del weights["choice"]
     assert set(log) == {*weights, "position_mm", *(f"view_{camera}" for camera in CAMERAS)}
     assert math.isclose(sum(weights[name] * log[name] for name in weights), loss.item(), rel_tol=1e-5)
     assert math.isclose(sum(log[f"view_{camera}"] for camera in CAMERAS), 1, rel_tol=1e-5)

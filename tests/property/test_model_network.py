@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import SEEN, SIZE, cameras_around, noise_images, tiny_net, tiny_observation
 
-from lerobot_histmv.model.config import HistoryConfig, PointsConfig
+from lerobot_histmv.model.config import HistoryConfig, PointsConfig, ViewConfig
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.network import HistMVNet, Observation
 from lerobot_histmv.windows import Window
@@ -31,9 +31,9 @@ def decide(net: HistMVNet, seen: Observation) -> tuple[torch.Tensor, Prediction,
     return encoding.weights, predicted, views[:, 1]
 
 
-@pytest.fixture(scope="module")
-def net() -> HistMVNet:
-    return tiny_net()
+@pytest.fixture(scope="module", params=["all", "one"])
+def net(request: pytest.FixtureRequest) -> HistMVNet:
+    return tiny_net(views=ViewConfig(decode=request.param))
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
@@ -42,12 +42,12 @@ def test_one_network_serves_any_number_of_views(net: HistMVNet, k: int) -> None:
     weights, predicted, _ = decide(net, seen)
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(2))
     assert weights.shape == (2, k)
-    assert predicted.log_heat.shape == (2, *SIZE)
+    assert predicted.log_heat.shape == (2, SIZE[0] * (k if net.config.views.decode == "all" else 1), SIZE[1])
     assert all(values.isfinite().all() for values in (predicted.position, predicted.quaternion, predicted.gripper))
 
 
-def test_the_view_that_acts_has_the_largest_product_of_weight_and_certainty(net: HistMVNet) -> None:
-    n, k = 7, 3
+def test_the_view_that_acts_has_the_largest_product_of_weight_and_certainty() -> None:
+    n, k, net = 7, 3, tiny_net(views=ViewConfig(decode="one"))
     seen = tiny_observation(n, k, net.semantics.text_width)
     with torch.no_grad():
         encoding = net.encode(seen)
@@ -81,7 +81,7 @@ def all_points() -> HistMVNet:
 @FEW
 @given(order=st.permutations(range(K)))
 def test_view_order_does_not_matter(all_points: HistMVNet, order: list[int]) -> None:
-    """There are no view codes: weights are permuted and all else stays."""
+    """There are no view codes: weights and heat maps are permuted and all else stays."""
     seen = tiny_observation(2, K, all_points.semantics.text_width)
     few = (
         torch.rand(seen.rgb[:, :, 0].shape, generator=torch.Generator().manual_seed(0)).flatten(2).argsort(dim=2)
@@ -92,7 +92,8 @@ def test_view_order_does_not_matter(all_points: HistMVNet, order: list[int]) -> 
     permuted_weights, permuted_predicted, permuted_view = decide(all_points, in_order(seen, order))
     torch.testing.assert_close(permuted_weights, weights[:, order], atol=1e-5, rtol=0)
     assert torch.tensor(order)[permuted_view].equal(view)
-    assert_same(permuted_predicted, predicted)
+    heat = predicted.log_heat.unflatten(1, (K, -1))[:, order].flatten(1, 2)
+    assert_same(permuted_predicted, replace(predicted, log_heat=heat))
 
 
 def test_view_order_hardly_matters_when_points_are_sampled() -> None:
