@@ -25,6 +25,7 @@ from dataset_tools.stages import Stage, read_state, run_stages
 RESULTS = Path(__file__).parent / "results" / "success.json"
 SETTINGS: dict[str, tuple[str, int]] = {
     "reach_target": ("reach_target", 50),
+    "reach_target_10": ("reach_target", 10),
     "pick_and_lift": ("pick_and_lift", 50),
     "pick_and_lift_10": ("pick_and_lift", 10),
     "pick_and_lift_fixed": ("pick_and_lift.red", 50),

@@ -87,7 +87,9 @@ class ViewAttention(nn.Module):
     def __init__(self, config: ViewConfig, width: int, text_width: int) -> None:
         super().__init__()
         self.form = config.mi_loss
-        self.score = nn.Sequential(nn.Linear(2 * width + text_width, width), nn.GELU(), nn.Linear(width, 1))
+        # The softmax cancels a last bias.
+        last = nn.Linear(width, 1, bias=False)
+        self.score = nn.Sequential(nn.Linear(2 * width + text_width, width), nn.GELU(), last)
         noise = torch.randn(width, config.mi_dims, generator=torch.Generator().manual_seed(0))
         self.register_buffer("projection", torch.linalg.qr(noise)[0])
 
