@@ -56,13 +56,13 @@ def data_stages(setting: str, folder: Path) -> list[Stage]:
     return [Stage("record", f"record {setting}", record), Stage("keyframe", "find keyframes", keyframe)]
 
 
-def training_stage(setting: str, seed: int, folder: Path, own: Path, preset: str = "train/default") -> Stage:
+def training_stage(setting: str, seed: int, folder: Path, own: Path, preset: str, *options: str) -> Stage:
     """Train a preset with one seed on the setting's data in ``folder``; the run goes to ``own``."""
     training = own / "train"
     train = (
         "lerobot-train", f"--config_path={config_files.find(preset)}", "--policy.device=cpu",
         f"--dataset.repo_id=local/{setting}_keyframes", f"--dataset.root={folder / 'keyframes'}",
-        f"--output_dir={training}", f"--seed={seed}",
+        f"--output_dir={training}", f"--seed={seed}", *options,
     )  # fmt: skip
     title = f"train {preset} on {setting}, seed {seed}"
     return Stage("train", title, train, resume=resume_training(train, training))
@@ -94,7 +94,7 @@ def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict
     """Train and evaluate one seed and write down what came out."""
     own = folder / f"seed_{seed}"
     evaluate = evaluation_stage(setting, last_checkpoint(own / "train"), own / "evaluation")
-    run_stages([training_stage(setting, seed, folder, own), evaluate], own, Console(), environment)
+    run_stages([training_stage(setting, seed, folder, own, "train/default"), evaluate], own, Console(), environment)
     state = read_state(own)
     (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
     add_result(
