@@ -11,13 +11,12 @@ preset. Killed and started again, it continues. Successes per file, seed and kin
 
 import argparse
 import json
-import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from success import OUTPUT, SETTINGS, add_result, anywhere, data_stages, evaluation_stage, training_stage
+from success import SETTINGS, add_result, anywhere, begin, evaluation_stage, training_stage
 
 from dataset_tools import config_files
 from dataset_tools.demo import last_checkpoint
@@ -82,17 +81,11 @@ def ablate(args: argparse.Namespace, file: str, seed: int, environment: dict[str
 def main() -> None:
     """Run the chosen files with all training seeds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--setting", choices=SETTINGS, default="push_buttons")
     parser.add_argument("--files", nargs="+", choices=FILES, default=FILES)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["clean"])
     parser.add_argument("--camera", default="", help="that is dead or hidden; by default drawn per episode")
-    parser.add_argument("--output", type=Path, default=OUTPUT)
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
-    args = parser.parse_args()
-    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
-    folder = args.output / args.setting
-    run_stages(data_stages(args.setting, folder), folder, Console(), environment)
+    args, environment = begin(parser, "push_buttons")
     for file in args.files:
         for seed in args.seeds:
             ablate(args, file, seed, environment)

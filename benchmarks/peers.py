@@ -20,7 +20,7 @@ from typing import Any
 
 from peers_figure import draw
 from rich.console import Console
-from success import SETTINGS, add_result, anywhere, data_stages
+from success import SETTINGS, add_result, anywhere, command_environment, data_stages
 from timed_training import TimedTraining, checkpoint
 
 from dataset_tools import config_files
@@ -186,7 +186,7 @@ def main() -> None:
     args = parse()
     for name in args.methods:
         config_files.find(METHODS[name].config)
-    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
+    environment = command_environment(args.threads)
     if args.methods:
         prepare(args, environment)
     for name in args.methods:

@@ -109,17 +109,33 @@ def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict
     )
 
 
-def main() -> None:
-    """Run one setting with its training seeds."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--setting", choices=SETTINGS, default="pick_and_lift")
-    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
+def command_environment(threads: int) -> dict[str, str]:
+    """Variables for the commands: no downloads, and so many threads."""
+    return {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(threads)}
+
+
+def begin(parser: argparse.ArgumentParser, setting: str) -> tuple[argparse.Namespace, dict[str, str]]:
+    """Parse the command line and make the data of the chosen setting; the options, and the commands' environment.
+
+    Args:
+        parser: with the benchmark's own options; those that all trainings share are added.
+        setting: the default one.
+    """
+    parser.add_argument("--setting", choices=SETTINGS, default=setting)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     args = parser.parse_args()
-    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
-    folder = args.output / args.setting
+    environment, folder = command_environment(args.threads), args.output / args.setting
     run_stages(data_stages(args.setting, folder), folder, Console(), environment)
+    return args, environment
+
+
+def main() -> None:
+    """Run one setting with its training seeds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
+    args, environment = begin(parser, "pick_and_lift")
+    folder = args.output / args.setting
     for seed in args.seeds:
         learn(args.setting, seed, folder, args.threads, environment)
 

@@ -8,12 +8,11 @@ A training of a third of the default's steps tells switches apart where the whol
 """
 
 import argparse
-import os
 from pathlib import Path
 
 from ablations import outcome
 from rich.console import Console
-from success import OUTPUT, SETTINGS, add_result, anywhere, data_stages, evaluation_stage, training_stage
+from success import SETTINGS, add_result, anywhere, begin, evaluation_stage, training_stage
 
 from dataset_tools.demo import last_checkpoint
 from dataset_tools.stages import read_state, run_stages
@@ -66,15 +65,9 @@ def main() -> None:
     """Run the chosen switches with all training seeds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--switches", nargs="+", choices=SWITCHES, default=list(SWITCHES))
-    parser.add_argument("--setting", choices=SETTINGS, default="pick_and_lift")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--output", type=Path, default=OUTPUT)
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
-    args = parser.parse_args()
-    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(args.threads)}
-    folder = args.output / args.setting
-    run_stages(data_stages(args.setting, folder), folder, Console(), environment)
+    args, environment = begin(parser, "pick_and_lift")
     for name in args.switches:
         for seed in args.seeds:
             measure(args, name, seed, environment)

@@ -16,6 +16,8 @@ import tempfile
 from pathlib import Path
 from statistics import mean
 
+from success import command_environment
+
 from dataset_tools import config_files
 from dataset_tools.shards import write_json
 
@@ -26,14 +28,15 @@ PRESET = "train/default"
 
 def train(root: Path, steps: int, threads: int) -> str:
     """What a short training logs."""
-    environment = {"HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false", "OMP_NUM_THREADS": str(threads)}
     with tempfile.TemporaryDirectory() as folder:
         command = (
             str(Path(sys.executable).with_name("lerobot-train")), f"--config_path={config_files.find(PRESET)}",
             "--policy.device=cpu", "--dataset.repo_id=local/speed", f"--dataset.root={root}",
             f"--output_dir={folder}/train", f"--steps={steps}", "--log_freq=10", "--save_checkpoint=false",
         )  # fmt: skip
-        found = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+        found = subprocess.run(
+            command, env=os.environ | command_environment(threads), capture_output=True, text=True, check=True
+        )
     return found.stdout + found.stderr
 
 
