@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -216,7 +216,8 @@ class HistMVPolicy(PreTrainedPolicy):
         """Key poses of the environments ``rows``, whose observations alone are in the batch."""
         window = read_window(batch, self.config.cameras)
         text = self.net.semantics.text(self._known(batch["task"]), window.tool.device)
-        encoding = self.net.encode(window.observe(text, *past.add_tools(rows, window.tool)))
+        tool, heat = past.add_tools(rows, window.tool[:, -1])
+        encoding = self.net.encode(replace(window, tool=tool, heat=heat).observe(text))
         fused, real = past.add_maps(rows, encoding.fused)
         count = real.sum(dim=1)
         enriched = self.net.remember(fused, text.repeat_interleave(count, dim=0), real)

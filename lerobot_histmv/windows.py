@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from einops import rearrange, repeat
+from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from lerobot_histmv import keys
 from lerobot_histmv.model import augment
@@ -32,7 +33,8 @@ class Window:
         depth: distance along the optical axis [m], 0 where invalid.
         intrinsics: fx, fy, cx, cy [pixels].
         extrinsics: T_world_cam.
-        tool: measured tool position [m].
+        tool: measured tool positions [m], the current one last.
+        heat: their intensity, 1 now, less with age, 0 where there was none.
         action: target position [m], quaternion wxyz, gripper; absent at inference.
         clip: stored semantic vectors of the views, of the images as recorded; absent if the data hold none that fit.
     """
@@ -42,7 +44,8 @@ class Window:
     depth: Float[Tensor, "n k y x"]
     intrinsics: Float[Tensor, "n k 4"]
     extrinsics: Float[Tensor, "n k 3 4"]
-    tool: Float[Tensor, "n 3"]
+    tool: Float[Tensor, "n p 3"]
+    heat: Float[Tensor, "n p"]
     action: Float[Tensor, "n 8"] | None
     clip: Float[Tensor, "n k g"] | None = None
 
@@ -53,38 +56,24 @@ class Window:
             raise ValueError(f"the batch lacks {keys.ACTION!r}, which training needs")
         return self.action
 
-    def observe(
-        self,
-        text: Float[Tensor, "b c"],
-        tool: Float[Tensor, "n p 3"] | None = None,
-        heat: Float[Tensor, "n p"] | None = None,
-    ) -> Observation:
-        """What the network sees; past tool positions come from the window itself unless given."""
-        if tool is None or heat is None:
-            tool, heat = self._past_tools()
-        owner = self.real.nonzero()[:, 0]
-        return Observation(self.rgb, self.depth, self.intrinsics, self.extrinsics, tool, heat, text[owner], self.clip)
-
-    def _past_tools(self) -> tuple[Float[Tensor, "n t 3"], Float[Tensor, "n t"]]:
-        """Tool positions of each real row's window and their heat at that row: 0 for padding and for the future."""
-        b, t = self.real.shape
-        tools = self.tool.new_zeros(b, t, 3)
-        tools[self.real] = self.tool
-        steps = torch.arange(t, device=self.real.device)
-        heat = causal_heat(steps[:, None] - steps) * self.real[:, None, :]
-        return repeat(tools, "b p c -> b t p c", t=t)[self.real], heat[self.real]
+    def observe(self, text: Float[Tensor, "b c"]) -> Observation:
+        """What the network sees, each window with its instruction."""
+        seen = text[self.real.nonzero()[:, 0]]
+        return Observation(
+            self.rgb, self.depth, self.intrinsics, self.extrinsics, self.tool, self.heat, seen, self.clip
+        )
 
     def moved(self, motion: Float[Tensor, "b 3 4"], turn: Float[Tensor, "b 4"]) -> "Window":
         """The window after a rigid motion of the world, one per window; ``turn`` is its rotation as a quaternion."""
         owner = self.real.nonzero()[:, 0]
         each, turns = motion[owner], turn[owner]
-        points = augment.move_points(each, torch.stack([self.tool, self.target[:, :3]], dim=1))
+        points = augment.move_points(each, torch.cat([self.tool, self.target[:, None, :3]], dim=1))
         rotated = augment.multiply_quaternions(turns, self.target[:, 3:7])
         return replace(
             self,
             extrinsics=augment.move_cameras(each, self.extrinsics[:, None])[:, 0],
-            tool=points[:, 0],
-            action=torch.cat([points[:, 1], rotated, self.target[:, 7:]], dim=-1),
+            tool=points[:, :-1],
+            action=torch.cat([points[:, -1], rotated, self.target[:, 7:]], dim=-1),
         )
 
     def distorted(self, config: augment.AugmentConfig) -> "Window":
@@ -132,11 +121,30 @@ def row_weights(real: Bool[Tensor, "b u"], past_steps: int) -> Float[Tensor, " n
     return torch.where(count <= past_steps, 1 / count, last.float())[real]
 
 
+def past_tools(
+    state: Float[Tensor, "b r c"], exist: Bool[Tensor, "b r"], rows: int
+) -> tuple[Float[Tensor, "b q p 3"], Float[Tensor, "b q p"]]:
+    """Tool positions [m] of the s steps before each of the last ``q = rows = 2s + 1`` rows and their own; their heat.
+
+    Args:
+        state: states that start with the tool position, of those rows and up to s earlier ones.
+        exist: which of them lie in the episode.
+        rows: how many rows want to know.
+    """
+    past_steps = rows // 2
+    front = rows + past_steps - state.shape[1]
+    tools = functional.pad(state[..., :3].masked_fill(~exist[..., None], 0), (0, 0, front, 0))
+    known = functional.pad(exist, (front, 0)).unfold(1, past_steps + 1, 1)
+    age = torch.arange(past_steps, -1, -1, device=state.device)
+    return rearrange(tools.unfold(1, past_steps + 1, 1), "b q c p -> b q p c"), causal_heat(age) * known
+
+
 def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None = None) -> Window:
     """Pack a batch of neighbourhoods (training) or of single observations (inference).
 
     Args:
-        batch: what LeRobot's loader or environment gives: 2s + 1 rows around each drawn row, or one row.
+        batch: what LeRobot's loader or environment gives: 2s + 1 rows around each drawn row, or one row. States may
+            have up to s more rows before them: without those, rows see no tool positions from before their window.
         cameras: views in the policy's order.
         stored_as: fingerprint of the CLIP vectors that may be taken from the batch; None for none.
 
@@ -148,13 +156,15 @@ def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None
     if missing:
         raise ValueError(f"observation lacks {missing}; the policy was made for the cameras {cameras}")
     state = batch[keys.STATE]
-    picked = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
-    real = picked.reshape(len(state), -1)
+    picked = real = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
+    tools, heat = state[:, None, None, :3], torch.ones_like(state[:, None, :1])
     if state.ndim == 3:
-        real, picked = choose_rows(~batch[f"{keys.STATE}_is_pad"])
+        exist, rows = ~batch[f"{keys.STATE}_is_pad"], batch[keys.INTRINSICS].shape[1]
+        real, picked = choose_rows(exist[:, -rows:])
+        tools, heat = past_tools(state, exist, rows)
 
     def pick(key: str) -> Tensor:
-        return batch[key][picked]
+        return batch[key][picked] if state.ndim == 3 else batch[key]
 
     depth = torch.stack([pick(keys.depth_key(camera)) for camera in cameras], dim=1)
     vectors = [keys.clip_key(stored_as, camera) for camera in cameras] if stored_as else []
@@ -165,7 +175,8 @@ def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None
         depth=MILLIMETRE * rearrange(depth, "n k 1 y x -> n k y x"),
         intrinsics=rearrange(pick(keys.INTRINSICS), "n (k c) -> n k c", c=4),
         extrinsics=rearrange(pick(keys.EXTRINSICS), "n (k i j) -> n k i j", i=3, j=4),
-        tool=pick(keys.STATE)[:, :3],
+        tool=tools[picked],
+        heat=heat[picked],
         action=pick(keys.ACTION) if batch.get(keys.ACTION) is not None else None,
         clip=torch.stack([pick(key) for key in vectors], dim=1) if stored else None,
     )

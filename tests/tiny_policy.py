@@ -70,12 +70,18 @@ def episode(steps: int, seed: int = 0, cameras: list[str] = CAMERAS) -> dict[str
 
 
 def window(rows: dict[str, torch.Tensor], end: int, past_steps: int = 2) -> dict[str, Any]:
-    """What the loader gives for the drawn row ``end``: 2s + 1 rows, marked as padding outside of the episode."""
-    wanted = torch.arange(end - past_steps, end + past_steps + 1)
+    """What the loader gives for the drawn row ``end``: 2s + 1 rows, marked as padding outside of the episode.
+
+    Of the state there are s more, before the others.
+    """
     last = len(rows[keys.STATE]) - 1
-    values = {key: rows[key][wanted.clamp(0, last)][None] for key in rows}
-    pads = {f"{key}_is_pad": ((wanted < 0) | (wanted > last))[None] for key in rows}
-    return {**values, **pads, "task": [TASK]}
+    values: dict[str, Any] = {"task": [TASK]}
+    for key in rows:
+        first = end - (2 if key == keys.STATE else 1) * past_steps
+        wanted = torch.arange(first, end + past_steps + 1)
+        values[key] = rows[key][wanted.clamp(0, last)][None]
+        values[f"{key}_is_pad"] = ((wanted < 0) | (wanted > last))[None]
+    return values
 
 
 def stack(batches: list[dict[str, Any]]) -> dict[str, Any]:

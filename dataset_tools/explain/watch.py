@@ -172,7 +172,7 @@ def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1
     memory, opening = _without(net, notes, past)
     return Record(
         views=_camera_views(policy, batch),
-        tool=_array(read_window(batch, policy.config.cameras).tool[0]),
+        tool=_array(read_window(batch, policy.config.cameras).tool[0, -1]),
         choosing=choosing,
         weights=_array(weights[0]),
         support=_array(support),

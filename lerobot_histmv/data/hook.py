@@ -18,6 +18,7 @@ from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, factory
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from packaging.specifiers import SpecifierSet
 
+from lerobot_histmv import keys
 from lerobot_histmv.data import checks, memory
 
 logger = logging.getLogger(__name__)
@@ -50,6 +51,18 @@ def install(dataset: Any) -> bool:
     dataset.reader = FrameReader.from_reader(dataset.reader)
     checks.check_dataset(dataset.meta, dataset.reader.columns.arrays)
     return True
+
+
+def reach_back(dataset: Any, steps: int) -> None:
+    """Let the samples of ``dataset`` have ``steps`` more rows of the state, before all others.
+
+    A map that the policy remembers shows the tool positions of the steps before it. In the windows of long episodes,
+    those of the first rows lie before the rows that LeRobot hands over; it has one reach for all observations.
+    """
+    indices = dataset.reader.delta_indices if type(dataset) is LeRobotDataset else None
+    if indices is not None:
+        first = indices[keys.STATE][0]
+        indices[keys.STATE] = [*range(first - steps, first), *indices[keys.STATE]]
 
 
 def install_hook() -> None:
@@ -90,6 +103,7 @@ def _wrap(original: Callable) -> Callable:
         for dataset in made:
             if dataset is not None:
                 install(dataset)
+                reach_back(dataset, cfg.policy.network.history.past_steps)
         return made
 
     return make_train_eval_datasets

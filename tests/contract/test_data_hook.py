@@ -8,15 +8,18 @@ from typing import Any
 import draccus
 import keyframed_dataset as sample
 import pytest
+import torch
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import EpisodeAwareSampler, factory
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, factory
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
 
+from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data import hook
 from lerobot_histmv.data.reader import FrameReader
 from lerobot_histmv.data.resume import ResumedSampler
+from lerobot_histmv.model.config import HistoryConfig, NetworkConfig
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,22 @@ def test_histmv_gets_the_frame_reader(root: Path) -> None:
     training, held_out = lerobot_train.make_train_eval_datasets(configured(root))
     assert isinstance(training.reader, FrameReader)
     assert held_out is None
+
+
+def test_states_reach_as_far_before_a_window_as_the_window_is_long(root: Path) -> None:
+    """Maps that are remembered show the tool's path before them: training has to know it for the window's first row."""
+    config = configured(root)
+    config.policy = HistMVConfig(device="cpu", network=NetworkConfig(history=HistoryConfig(past_steps=2)))
+    dataset, _ = lerobot_train.make_train_eval_datasets(config)
+    plain = LeRobotDataset(sample.REPO, root=root)
+    for row in range(len(dataset)):
+        item, around = dataset[row], torch.arange(row - 4, row + 3)
+        episodes = torch.tensor([plain[int(i)]["episode_index"] if 0 <= i < len(plain) else -1 for i in around])
+        outside = episodes != item["episode_index"]
+        assert item[f"{keys.STATE}_is_pad"].equal(outside)
+        for i in around[~outside]:
+            assert item[keys.STATE][i - row + 4].equal(plain[int(i)][keys.STATE])
+        assert len(item[keys.INTRINSICS]) == len(item[keys.ACTION]) == 5
 
 
 def test_held_out_episodes_get_it_too(root: Path) -> None:

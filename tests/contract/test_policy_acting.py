@@ -7,6 +7,8 @@ import pytest
 import torch
 from tiny_policy import CAMERAS, TASK, episode, observation, stack, tiny_config, tiny_policy
 from tiny_policy import window as window_of
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import canonical
@@ -41,9 +43,9 @@ def test_action_is_a_canonical_pose_in_the_workspace_and_a_gripper_command(
 
 
 def whole_window(policy: HistMVPolicy, rows: dict[str, torch.Tensor], steps: int) -> Any:
-    """Predictions for every step of an episode that is encoded and decoded at once, as training does it."""
+    """Predictions for every step of the window before ``steps``, encoded and decoded at once, as training does it."""
     window = read_window(window_of(rows, steps - 1, LONG - 1), policy.config.cameras)
-    assert window.real.shape == (1, steps)
+    assert window.real.shape == (1, min(steps, LONG))
     seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
     with torch.no_grad():
         return policy.net(seen, window.real, "best")
@@ -61,6 +63,16 @@ def test_cached_decisions_equal_those_of_the_whole_window(policy: HistMVPolicy, 
     assert policy.last_decision is not None
     torch.testing.assert_close(policy.last_decision.weights, encoding.weights[-1:], atol=1e-5, rtol=0)
     assert policy.last_decision.view.equal(views[-1:, 1])
+
+
+@pytest.mark.parametrize("steps", [LONG + 1, 2 * LONG - 1, 3 * LONG])
+def test_cached_decisions_equal_those_of_the_last_window_of_a_long_episode(policy: HistMVPolicy, steps: int) -> None:
+    """Also the oldest map of the window shows the tool's path before it, as it does when it is remembered."""
+    rows = episode(steps, seed=steps)
+    action = act(policy, rows, steps)[-1]
+    predicted = whole_window(policy, rows, steps)[1]
+    torch.testing.assert_close(action[:3], predicted.position[-1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(action[3:7].abs(), predicted.quaternion[-1].abs(), atol=1e-5, rtol=0)
 
 
 def test_decisions_far_beyond_the_window_stay_finite_and_forget_the_oldest_step(policy: HistMVPolicy) -> None:
@@ -177,3 +189,25 @@ def test_scene_outside_of_the_workspace_gives_an_action(policy: HistMVPolicy) ->
         batch[keys.depth_key(camera)] = batch[keys.depth_key(camera)] + 20_000
     policy.reset()
     assert policy.select_action(batch).isfinite().all()
+
+
+def remembered_bytes(policy: HistMVPolicy) -> int:
+    """Size of the memory of past steps: of whole storages, which a view into a larger tensor keeps alive."""
+    leaves = tree_leaves(vars(policy._past))
+    storages = [leaf.untyped_storage() for leaf in leaves if isinstance(leaf, torch.Tensor)]
+    return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+
+
+def test_a_decision_late_in_a_long_episode_costs_what_the_first_with_full_memory_does(policy: HistMVPolicy) -> None:
+    rows = episode(2 * LONG + 1)
+    policy.reset()
+    operations, remembered = [], []
+    for step in range(2 * LONG + 1):
+        with FlopCounterMode(display=False) as counter:
+            policy.select_action(observation(rows, step))
+        operations.append(counter.get_total_flops())
+        remembered.append(remembered_bytes(policy))
+    assert 0 < operations[0] < operations[LONG - 1], "what is remembered costs something"
+    assert 0 < remembered[0] < remembered[LONG - 1]
+    assert set(operations[LONG - 1 :]) == {operations[LONG - 1]}
+    assert set(remembered[LONG - 1 :]) == {remembered[LONG - 1]}

@@ -7,11 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import SEEN, SIZE, cameras_around, noise_images, tiny_net, tiny_observation
+from torch.nn.functional import pad
 
 from lerobot_histmv.model.config import HistoryConfig, PointsConfig, ViewConfig
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.network import HistMVNet, Observation
-from lerobot_histmv.windows import Window
+from lerobot_histmv.windows import Window, past_tools
 
 K = 3
 FEW = settings(max_examples=5, deadline=None, derandomize=True)
@@ -131,6 +132,13 @@ def test_scene_outside_of_the_workspace_gives_finite_numbers(net: HistMVNet) -> 
     assert predicted.position.isfinite().all()
 
 
+def walked(tools: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Tool positions (t, p, 3) up to each of t steps, and their heat."""
+    exist = torch.ones(1, len(tools), dtype=torch.bool)
+    before, heat = past_tools(tools[None], exist, rows=2 * len(tools) + 1)
+    return {"tool": before[0, -len(tools) :], "heat": heat[0, -len(tools) :]}
+
+
 def window(steps: int, seed: int = 0, k: int = 2) -> Window:
     """One window of ``steps`` real rows."""
     generator = torch.Generator().manual_seed(seed)
@@ -142,7 +150,7 @@ def window(steps: int, seed: int = 0, k: int = 2) -> Window:
         depth=depth,
         intrinsics=intrinsics.expand(steps, k, 4),
         extrinsics=extrinsics.expand(steps, k, 3, 4),
-        tool=SEEN + 0.2 * torch.randn(steps, 3, generator=generator),
+        **walked(SEEN + 0.2 * torch.randn(steps, 3, generator=generator)),
         action=None,
     )
 
@@ -164,11 +172,11 @@ def remembering(request: pytest.FixtureRequest) -> HistMVNet:
 @given(known=st.integers(1, 4), seed=st.integers(1, 100))
 def test_future_steps_change_nothing_in_earlier_decisions(remembering: HistMVNet, known: int, seed: int) -> None:
     rows, other = window(5), window(5, seed)
-    images = {
-        name: torch.cat([getattr(rows, name)[:known], getattr(other, name)[known:]])
-        for name in ("rgb", "depth", "tool")
+    changed = {
+        name: torch.cat([getattr(rows, name)[:known], getattr(other, name)[known:]]) for name in ("rgb", "depth")
     }
-    expected, found = replay(remembering, rows), replay(remembering, replace(rows, **images))
+    changed |= walked(torch.cat([rows.tool[:known, -1], other.tool[known:, -1]]))
+    expected, found = replay(remembering, rows), replay(remembering, replace(rows, **changed))
     assert_same(found, expected, slice(known))
     assert not torch.allclose(found.position[known:], expected.position[known:], atol=1e-6)
 
@@ -193,14 +201,10 @@ def test_history_matters_from_the_third_step_on() -> None:
 def test_windows_of_different_length_do_not_mix(remembering: HistMVNet) -> None:
     long, short = window(5), window(2, seed=3)
     real = torch.cat([long.real, torch.tensor([[False] * 3 + [True] * 2])])
-    both = Window(
-        real,
-        *(
-            torch.cat([getattr(long, n), getattr(short, n)])
-            for n in ("rgb", "depth", "intrinsics", "extrinsics", "tool")
-        ),
-        None,
-    )
+    room = long.tool.shape[1] - short.tool.shape[1]
+    short = replace(short, tool=pad(short.tool, (0, 0, room, 0)), heat=pad(short.heat, (room, 0)))
+    names = ("rgb", "depth", "intrinsics", "extrinsics", "tool", "heat")
+    both = replace(long, real=real, **{n: torch.cat([getattr(long, n), getattr(short, n)]) for n in names})
     found = replay(remembering, both)
     for rows, expected in ((slice(5), replay(remembering, long)), (slice(5, 7), replay(remembering, short))):
         torch.testing.assert_close(found.position[rows], expected.position, atol=2e-5, rtol=0)

@@ -96,7 +96,9 @@ def test_cameras_given_are_not_changed() -> None:
 def shifted_scene(most: int) -> tuple[Window, Window]:
     """A window before and after nothing but a pixel shift."""
     rgb, depth, intrinsics, extrinsics = scene()
-    window = Window(torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, SEEN.expand(N, 3), None)
+    window = Window(
+        torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, SEEN.expand(N, 1, 3), torch.ones(N, 1), None
+    )
     torch.manual_seed(0)
     return window, window.distorted(replace(OFF, pixels=most))
 

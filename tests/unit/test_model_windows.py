@@ -50,7 +50,8 @@ def test_only_real_rows_are_kept_in_order() -> None:
     rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
     assert len(window.tool) == len(rows) == window.real.sum()
     for n, (b, t) in enumerate(rows):
-        assert window.tool[n].equal(batch[keys.STATE][b, t, :3])
+        assert window.tool[n, -1].equal(batch[keys.STATE][b, t, :3])
+        assert window.heat[n, -1] == 1
         assert window.action[n].equal(batch[keys.ACTION][b, t])
         for k, camera in enumerate(CAMERAS):
             assert window.rgb[n, k].equal(batch[keys.rgb_key(camera)][b, t])
@@ -81,7 +82,8 @@ def test_padding_rows_have_no_influence_on_the_window() -> None:
             values[padded] = torch.nan
     first, second = read_window(batch, CAMERAS), read_window(spoiled, CAMERAS)
     assert all(
-        getattr(first, name).equal(getattr(second, name)) for name in ("rgb", "depth", "intrinsics", "tool", "action")
+        getattr(first, name).equal(getattr(second, name))
+        for name in ("rgb", "depth", "intrinsics", "tool", "heat", "action")
     )
 
 
@@ -99,6 +101,8 @@ def test_single_observations_are_windows_of_one_step() -> None:
     assert window.real.shape == (B, 1)
     assert window.real.all()
     assert window.rgb.shape == (B, K, 3, *SIZE)
+    assert window.tool.equal(batch[keys.STATE][:, None, :3])
+    assert window.heat.equal(torch.ones(B, 1))
     assert window.action is None
 
 
@@ -123,14 +127,21 @@ def test_heat_is_1_now_decays_with_age_and_is_0_for_the_future() -> None:
     assert (heat[3:] > 0).all()
 
 
-def test_each_row_sees_the_tool_now_and_before_and_never_the_future() -> None:
-    batch = window_batch()
-    window = read_window(batch, CAMERAS)
-    seen = window.observe(torch.zeros(B, 2))
+@pytest.mark.parametrize("more", [0, 2, S])
+def test_each_row_sees_the_tool_now_and_in_the_last_s_steps_that_are_known_and_never_the_future(more: int) -> None:
+    """With s more states than images, as training reads them, every row knows all of its last s steps."""
+    batch, padded = window_batch(), f"{keys.STATE}_is_pad"
+    earlier = torch.randn(B, more, 14, generator=torch.Generator().manual_seed(1))
+    batch[keys.STATE] = states = torch.cat([earlier, batch[keys.STATE]], dim=1)
+    before = batch[padded][:, :1].expand(-1, more).clone()
+    before[:, : more // 2] = True  # the first row's episode starts before the images, but not with the states
+    batch[padded] = absent = torch.cat([before, batch[padded]], dim=1)
+    seen = read_window(batch, CAMERAS).observe(torch.zeros(B, 2))
     rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
     for n, (b, t) in enumerate(rows):
         drawn = {tuple(seen.tool[n, p].tolist()): seen.heat[n, p].item() for p in range(S + 1) if seen.heat[n, p] > 0}
-        ages = {tuple(batch[keys.STATE][b, past, :3].tolist()): t - past for past in range(WINDOWS[b][0], t + 1)}
+        last = [i for i in range(max(0, t + more - S), t + more + 1) if not absent[b, i]]
+        ages = {tuple(states[b, i, :3].tolist()): t + more - i for i in last}
         assert set(drawn) == set(ages), "real steps up to now, and no other"
         torch.testing.assert_close(
             torch.tensor([drawn[tool] for tool in ages]),
@@ -155,9 +166,12 @@ def moved_window() -> tuple[Window, Window, torch.Tensor]:
 
 def test_world_motion_keeps_the_projections_of_tool_and_target() -> None:
     window, moved, _ = moved_window()
-    for before, after in ((window.tool, moved.tool), (window.action[:, :3], moved.action[:, :3])):
-        expected, z = project(before[:, None], window.intrinsics, window.extrinsics)
-        found, z_moved = project(after[:, None], moved.intrinsics, moved.extrinsics)
+    for before, after in (
+        (window.tool, moved.tool),
+        (window.action[:, None, :3], moved.action[:, None, :3]),
+    ):
+        expected, z = project(before, window.intrinsics, window.extrinsics)
+        found, z_moved = project(after, moved.intrinsics, moved.extrinsics)
         ahead = z > 0.05
         torch.testing.assert_close(z_moved, z, atol=1e-5, rtol=0)
         torch.testing.assert_close(found[ahead], expected[ahead], atol=5e-2, rtol=1e-4)
@@ -176,7 +190,7 @@ def test_world_motion_turns_the_target_with_the_world_and_keeps_the_gripper() ->
 
 def test_all_steps_of_a_window_move_together() -> None:
     window, moved, _ = moved_window()
-    before, after = (torch.cdist(w.tool[:5], w.tool[:5]) for w in (window, moved))
+    before, after = (torch.cdist(w.tool[:5, -1], w.tool[:5, -1]) for w in (window, moved))
     torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
 
 
