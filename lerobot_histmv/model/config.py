@@ -142,6 +142,12 @@ class ViewConfig:
             )
         require("views.mi_loss", self.mi_loss, ("nmi", "text", "literal"))
         require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected", "ranked"))
+        for name, default in (("act", "certainty"), ("train_choice", "ranked")):
+            if self.decode == "all" and getattr(self, name) != default:
+                raise ValueError(
+                    f"views.{name}={getattr(self, name)!r} chooses one view and has no effect with views.decode='all'; "
+                    "use views.decode='one', or leave it out"
+                )
 
 
 @dataclass(frozen=True)
