@@ -74,8 +74,9 @@ def around_peak(
 class Merge(nn.Module):
     """A decoded map joined with a finer skip: convolve each at its own size, add, normalise, leaky ReLU.
 
-    This is a convolution of both maps side by side, except that the coarse one is upsampled after its part of the
-    convolution instead of before: a quarter of the work there, and no copy to put the maps together.
+    For maps of one size this is a convolution of both side by side, without the copy that puts them together. A coarser
+    one is upsampled (nearest neighbour) after its part of the convolution instead of before: another function, whose
+    kernel spans coarse pixels, for a quarter of the work.
     """
 
     def __init__(self, coarse: int, skip: int, channels_out: int, normalise: bool) -> None:

@@ -1,6 +1,7 @@
 """Every ablation and the presets beside it: the file trains a network without idle weights, which acts as it learns."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,28 @@ from tiny_weights import clip_file
 from dataset_tools import config_files
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.geometry import canonical
-from lerobot_histmv.model.config import NetworkConfig
+from lerobot_histmv.model.config import LossConfig, NetworkConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
 ABLATIONS = [name for name in config_files.names() if name.startswith("ablation/")]
 PRESETS = ["train/paper", "train/hiveformer"]
 DEFAULT = "train/default"
+OFF: dict[str, dict[str, dict[str, Any]]] = {
+    "mva": {"views": {"fusion": "mean"}},
+    "history": {"history": {"enabled": False}},
+    "st": {"texture": {"encoder": "backbone"}, "semantics": {"image": "none"}},
+}
+"""What each column of the documentation's table means when it says off, in the order of the columns."""
+ONLY: dict[str, dict[str, dict[str, Any]]] = {
+    "clip_only": {"texture": {"encoder": "none"}},
+    "panet_only": {"semantics": {"image": "none"}},
+}
+TEXT = (Path(__file__).parents[2] / "docs/ablations.md").read_text()
+ROWS = re.findall(r"^\| \d \| (on|off) \| (on|off) \| (on|off) \|.*`ablation/(\w+)` \|$", TEXT, re.MULTILINE)
+DOCUMENTED = {
+    name: frozenset(module for module, word in zip(OFF, words, strict=True) if word == "off") for *words, name in ROWS
+}
+"""Modules that each numbered row of the documentation's table switches off."""
 
 
 def read(name: str) -> dict[str, Any]:
@@ -83,22 +100,39 @@ def test_one_training_step_teaches_every_weight_and_acting_equals_the_whole_wind
 
 def test_all_rows_of_the_table_exist() -> None:
     """Paper table 4 has every combination of three modules but that without any."""
-    modules = {"mva": ["mva"], "history": ["history"], "st": ["st"]}
-    rows = {name.removeprefix("ablation/") for name in ABLATIONS} - {"full", "clip_only", "panet_only"}
-    pairs = {"mva_history", "mva_st", "history_st"}
-    assert rows == set(modules) | pairs
+    assert set(DOCUMENTED) | set(ONLY) == {name.removeprefix("ablation/") for name in ABLATIONS}
+    off = set(DOCUMENTED.values())
+    assert len(off) == len(DOCUMENTED) == 2 ** len(OFF) - 1
+    assert frozenset(OFF) not in off
+
+
+def test_names_of_the_files_are_those_of_the_modules_that_are_on() -> None:
+    names = {name: frozenset(OFF) - off for name, off in DOCUMENTED.items()}
+    assert names.pop("full") == frozenset(OFF)
+    assert {name: frozenset(name.split("_")) for name in names} == names
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_an_ablation_differs_from_the_default_preset_in_its_switches_only(name: str) -> None:
+def test_an_ablation_is_the_default_preset_without_what_the_documentation_says(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     content, default = read(name), read(DEFAULT)
-    network = content["policy"].pop("network", {})
-    assert content == default
-    modules = name.removeprefix("ablation/").split("_")
-    if modules[-1] != "only" and modules != ["full"]:
-        assert ("history" in network) == ("history" not in modules)
-        assert ("views" in network) == ("mva" not in modules)
-        assert ("texture" in network) == ("semantics" in network) == ("st" not in modules)
+    content["policy"].pop("network", None)
+    assert content == default, "nothing but switches of the network differs"
+    row, expected = name.removeprefix("ablation/"), {}
+    for switches in [ONLY[row]] if row in ONLY else [OFF[module] for module in DOCUMENTED[row]]:
+        expected |= switches
+    network, policy = NetworkConfig(), load(config_files.find(name), monkeypatch).policy
+    assert isinstance(policy, HistMVConfig)
+    changed = {part: replace(getattr(network, part), **values) for part, values in expected.items()}
+    assert policy.network == replace(network, **changed)
+
+
+def test_the_default_preset_has_all_that_ablations_switch_off() -> None:
+    network = NetworkConfig()
+    assert network.history.enabled
+    assert (network.views.fusion, network.views.decode) == ("attention", "all")
+    assert (network.texture.encoder, network.semantics.image) == ("panet", "clip")
 
 
 def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,10 +141,32 @@ def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> N
     network, loss = cfg.policy.network, cfg.policy.loss
     assert (cfg.batch_size, cfg.steps, cfg.policy.get_optimizer_preset().lr) == (16, 100_000, 5e-4)
     assert len(cfg.policy.cameras) == 3
-    assert not network.texture.use_xyz
-    assert network.texture.encoder == "panet"
-    assert (network.semantics.clip_model, network.semantics.trained) == ("ViT-B-32", False)
-    assert (network.views.mi_loss, network.views.act) == ("literal", "weight")
-    assert not any(vars(network.decoder).values())
-    assert loss.gripper == "mse"
-    assert loss.heatmap == loss.choice == loss.paraphrase == 0
+    assert (network.texture.encoder, network.texture.language, network.texture.use_xyz) == ("panet", False, False)
+    semantics = network.semantics
+    assert (semantics.image, semantics.clip_model, semantics.text) == ("clip", "ViT-B-32", "clip")
+    assert (semantics.clip_pretrained, semantics.trained) == ("openai", False)
+    views = network.views
+    assert (views.fusion, views.decode, views.train_choice) == ("attention", "one", "argmax")
+    assert (views.mi_loss, views.act) == ("literal", "weight")
+    assert network.points.enabled
+    assert network.history.enabled
+    assert set(vars(network.decoder).values()) == {False}
+    assert loss == LossConfig(
+        action=1.0, mutual_information=0.01, heatmap=0.0, choice=0.0, paraphrase=0.0, gripper="mse", position_unit=1.0
+    )
+    assert cfg.policy.augment == replace(STILL, pixels=8), "images are shifted, as Hiveformer's are; nothing else moves"
+
+
+def test_the_peer_has_nothing_of_ours_in_its_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = load(config_files.find("train/hiveformer"), monkeypatch)
+    assert isinstance(cfg.policy, HistMVConfig)
+    network, loss = cfg.policy.network, cfg.policy.loss
+    assert (network.views.fusion, network.views.decode) == ("tokens", "all")
+    assert (network.texture.encoder, network.texture.language, network.texture.use_xyz) == ("backbone", False, False)
+    assert network.semantics.image == "none"
+    assert not network.points.enabled
+    assert network.history.enabled
+    assert not network.history.skip_first
+    assert set(vars(network.decoder).values()) == {False}
+    assert (loss.heatmap, loss.position_unit) == (0, 1)
+    assert cfg.policy.augment == replace(STILL, pixels=8)

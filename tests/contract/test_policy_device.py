@@ -17,14 +17,18 @@ from lerobot_histmv.model.augment import AugmentConfig
 from lerobot_histmv.model.config import NetworkConfig, SemanticsConfig, ViewConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
+CHOICES = ["argmax", "sampled", "expected", "ranked"]
+"""Views decoded in training where one view decides."""
+
 
 def networks(folder: Path) -> dict[str, NetworkConfig]:
     """Every way to choose views, and frozen towers, which lie outside of the policy's module tree."""
     weights = folder / "clip.pt"
     torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
     return {
-        "ranked": tiny_network(),
-        "sampled": tiny_network(views=ViewConfig(decode="one", train_choice="sampled")),
+        "all": tiny_network(),
+        **{choice: tiny_network(views=ViewConfig(decode="one", train_choice=choice)) for choice in CHOICES},
+        "weight": tiny_network(views=ViewConfig(decode="one", act="weight")),
         "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
     }
 
@@ -42,7 +46,7 @@ def train(policy: HistMVPolicy, batch: dict[str, Any]) -> tuple[float, dict[str,
     return loss.item(), {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
 
 
-@pytest.mark.parametrize("name", ["ranked", "sampled", "frozen"])
+@pytest.mark.parametrize("name", ["all", *CHOICES, "frozen"])
 def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_path: Path) -> None:
     config = tiny_config(network=networks(tmp_path)[name], augment=AugmentConfig(depth_noise=0.01))
     batch = stack([window(episode(5), 4), window(episode(5), 1), window(episode(1), 0)]) | {"index": torch.arange(3)}
@@ -58,7 +62,7 @@ def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_pat
     assert_same_gradients([others[key].values for key in gradients], list(gradients.values()), list(gradients))
 
 
-@pytest.mark.parametrize("name", ["ranked", "frozen"])
+@pytest.mark.parametrize("name", ["all", "ranked", "weight", "frozen"])
 def test_acting_elsewhere_gives_the_same_actions(name: str, tmp_path: Path) -> None:
     config, rows = tiny_config(network=networks(tmp_path)[name]), episode(3)
     here = tiny_policy(config)

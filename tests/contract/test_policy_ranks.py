@@ -27,7 +27,8 @@ INSTRUCTIONS = {TASK: [TASK], "press the button": ["press the button", "push the
 
 
 def policy_without_chance(choice: str) -> HistMVPolicy:
-    network = tiny_network(views=ViewConfig(decode="one", train_choice=choice))
+    """The policy that decodes "all" views together, or in training those that ``choice`` picks."""
+    network = tiny_network(views=ViewConfig() if choice == "all" else ViewConfig(decode="one", train_choice=choice))
     policy = tiny_policy(tiny_config(network=network, instructions=INSTRUCTIONS)).train()
     policy.net.points.eval()
     return policy
@@ -85,7 +86,11 @@ def sharded(rank: int, folder: Path, choice: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "choice"), [(replicated, "ranked"), (replicated, "expected"), (replicated, "argmax"), (sharded, "ranked")]
+    ("way", "choice"),
+    [
+        *((replicated, choice) for choice in ("all", "ranked", "expected", "argmax")),
+        *((sharded, choice) for choice in ("all", "ranked")),
+    ],
 )
 def test_ranks_give_the_gradients_of_one_big_batch(way: Any, choice: str, tmp_path: Path) -> None:
     in_ranks(RANKS, tmp_path / "log", way, tmp_path, choice)

@@ -1,11 +1,21 @@
 """Heat map over a view's cloud: a distribution on valid pixels whose expectation is the position."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor, nn
 
 from lerobot_histmv.model.config import DecoderConfig
-from lerobot_histmv.model.decoder import OFFSET_UNIT, Decoder, Prediction, around_peak, spatial_log_softmax
+from lerobot_histmv.model.decoder import (
+    LOCAL_CHANNELS,
+    OFFSET_UNIT,
+    Decoder,
+    Prediction,
+    around_peak,
+    spatial_log_softmax,
+)
 
 M, Y, X, WIDTH = 3, 32, 48, 8
 SKIPS = [4, 5, 5, 5]
@@ -60,7 +70,7 @@ def test_a_heat_map_torn_between_two_objects_decides_for_the_stronger() -> None:
     torch.testing.assert_close(everything, torch.ones(M))
 
 
-def inputs(seed: int = 1) -> dict[str, object]:
+def inputs(seed: int = 1) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(seed)
     maps, view = torch.randn(2, M, WIDTH, Y // 16, X // 16, generator=generator)
     skips = [
@@ -83,27 +93,69 @@ def decoder(seed: int = 0) -> Decoder:
     return Decoder(WIDTH, SKIPS, DecoderConfig())
 
 
-def decode(module: Decoder, given: dict[str, object]) -> Prediction:
-    return module(**given)  # type: ignore[arg-type]
+def decode(module: Decoder, given: dict[str, Any]) -> Prediction:
+    return module(**given)
 
 
-def test_planted_peak_holds_all_heat() -> None:
-    logits, valid = logits_and_mask()
-    for m, (row, column) in enumerate([(3, 5), (17, 29), (31, 47)]):
-        logits[m, row, column], valid[m, row, column] = 100.0, True
-    heat = spatial_log_softmax(logits, valid).exp()
-    peaks = torch.stack([heat[0, 3, 5], heat[1, 17, 29], heat[2, 31, 47]])
-    assert peaks.eq(1).all()
+PIXELS = [(5, 3), (19, 29), (29, 47)]
+"""Row and column at which each view's heat map gets its peak."""
+
+
+class Planted(nn.Module):
+    """In place of the first decoder: heat map logits that do not depend on what is seen."""
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__()
+        self.logits = logits
+
+    def forward(self, maps: Tensor, skips: list[Tensor], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        assert self.logits.shape == (len(maps), *size)
+        return self.logits, torch.zeros(len(maps), LOCAL_CHANNELS, Y // 4, X // 4)
+
+
+def plant(logits: Tensor, valid: Tensor, views: Sequence[int], height: float = 100.0) -> None:
+    """Raise a peak at the valid pixel of the given views; in all views a higher one where nothing was measured."""
+    logits[:, 13, 11], valid[:, 13, 11] = 2 * height, False
+    for m in views:
+        row, column = PIXELS[m]
+        logits[m, row, column], valid[m, row, column] = height, True
+
+
+def points_under_peaks(cloud: Tensor) -> Tensor:
+    return torch.stack([cloud[m, :, row, column] for m, (row, column) in enumerate(PIXELS)])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_target_planted_in_the_cloud_is_recovered_exactly(training: bool) -> None:
+    given, module = inputs(), decoder().train(training)
+    logits, given["valid"] = logits_and_mask()
+    plant(logits, given["valid"], range(M))
+    module.position = Planted(logits)
+    assert given["valid"].sum() > M * Y * X / 3, "many pixels compete"
+    assert given["cloud"][0].flatten(1).unique(dim=1).shape == (3, Y * X), "no two points are alike"
+    assert decode(module, given).surface.equal(points_under_peaks(given["cloud"]))
+
+
+def test_acting_recovers_a_target_from_which_the_rest_of_the_heat_pulls_in_training() -> None:
+    given, module = inputs(), decoder()
+    given["cloud"] = 10 * given["cloud"]  # no two points within the peak's reach
+    noise, given["valid"] = logits_and_mask()
+    logits = 0.1 * noise
+    plant(logits, given["valid"], range(M), height=0.7)
+    module.position = Planted(logits)
+    target = points_under_peaks(given["cloud"])
+    pulled, acting = decode(module.train(), given), decode(module.eval(), given)
+    assert acting.surface.equal(target)
+    assert acting.certainty.less(0.9).all()
+    assert (pulled.surface - target).norm(dim=1).gt(0.1).all()
 
 
 def test_only_valid_pixel_is_recovered_exactly() -> None:
     given, module = inputs(), decoder()
-    pixels = [(3, 5), (17, 29), (31, 47)]
     given["valid"] = torch.zeros(M, Y, X, dtype=torch.bool)
-    for m, (row, column) in enumerate(pixels):
+    for m, (row, column) in enumerate(PIXELS):
         given["valid"][m, row, column] = True
-    expected = torch.stack([given["cloud"][m, :, row, column] for m, (row, column) in enumerate(pixels)])
-    torch.testing.assert_close(decode(module, given).surface, expected, atol=0, rtol=0)
+    assert decode(module, given).surface.equal(points_under_peaks(given["cloud"]))
 
 
 def test_position_is_the_heat_map_s_mean_over_the_cloud_plus_an_offset() -> None:
@@ -170,15 +222,37 @@ def test_decoders_use_history_view_and_every_skip(name: str) -> None:
     assert all(leaf.grad.abs().sum() > 0 for leaf in leaves)
 
 
+def together(module: Decoder, steps: list[dict[str, Any]], weights: Tensor) -> tuple[Prediction, Tensor]:
+    """Decode steps whose M views are the pairs of ``inputs``; also each view's share of the heat."""
+    names = ("maps", "view", "cloud", "valid", "eye")
+    maps, views, cloud, valid, eyes = (torch.stack([given[name] for given in steps]) for name in names)
+    skips = [torch.cat(levels) for levels in zip(*(given["skips"] for given in steps), strict=True)]
+    return module.together(maps, views, skips, cloud, valid, eyes, weights)
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("view", range(M))
+def test_target_planted_in_one_of_several_views_is_recovered_exactly(view: int, training: bool) -> None:
+    """Also in a view of small weight: a certain view outvotes what the weights expect."""
+    module, steps, planted = decoder().train(training), [inputs(1), inputs(2)], [view, (view + 1) % M]
+    logits = torch.empty(len(steps), M, Y, X)
+    for given, values, at in zip(steps, logits, planted, strict=True):
+        noise, given["valid"] = logits_and_mask()
+        plant(values.copy_(noise), given["valid"], [at])
+    module.position = Planted(logits.flatten(0, 1))
+    found, shares = together(module, steps, torch.tensor([[0.7, 0.25, 0.05], [0.25, 0.05, 0.7]]))
+    expected = [points_under_peaks(given["cloud"])[at] for given, at in zip(steps, planted, strict=True)]
+    assert found.surface.equal(torch.stack(expected))
+    assert shares.equal(torch.eye(M)[planted])
+
+
 def test_one_softmax_over_all_views_has_their_weights_as_prior() -> None:
     given, module = inputs(), decoder()
-    skips = given.pop("skips")
-    maps, views, cloud, valid, eyes = (given[name][None] for name in ("maps", "view", "cloud", "valid", "eye"))
+    valid = given["valid"]
     even, uneven = torch.full((1, M), 1 / M), torch.tensor([[0.7, 0.25, 0.05]])
     before, after = (
-        module.together(maps, views, skips, cloud, valid, eyes, weights)[0].log_heat.unflatten(1, (M, Y))[0]
-        for weights in (even, uneven)
+        together(module, [given], weights)[0].log_heat.unflatten(1, (M, Y))[0] for weights in (even, uneven)
     )
-    ratio = (after - before)[valid[0]].exp() / (uneven / even)[0].repeat_interleave(valid[0].sum(dim=(1, 2)))
+    ratio = (after - before)[valid].exp() / (uneven / even)[0].repeat_interleave(valid.sum(dim=(1, 2)))
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), atol=0, rtol=1e-3)
     torch.testing.assert_close(after.exp().sum(), torch.tensor(1.0))

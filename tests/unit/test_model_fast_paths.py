@@ -6,9 +6,11 @@ import pytest
 import torch
 from tiny_policy import tiny_policy
 from torch import Tensor
+from torch.func import functional_call
 from torch.nn import functional
 
 from lerobot_histmv.model.cameras import squared_distances
+from lerobot_histmv.model.decoder import Merge
 from lerobot_histmv.model.image_tower import resized
 from lerobot_histmv.model.layers import GROUP, group_norm, resize_bilinear
 from lerobot_histmv.model.network import pick_images
@@ -51,6 +53,48 @@ def test_squared_distances() -> None:
     assert_same(
         squared_distances, lambda cloud, points: (cloud - points[:, :, None, None]).square().sum(dim=1), cloud, points
     )
+
+
+def merging(normalise: bool) -> tuple[Callable[..., Tensor], list[Tensor]]:
+    """``Merge`` as a function of both maps and its weights, and these: the coarse map's, the skip's, the bias."""
+    merge, names = Merge(3, 5, 7, normalise).double(), ["coarse.weight", "skip.weight", "skip.bias"]
+
+    def function(maps: Tensor, skip: Tensor, *values: Tensor) -> Tensor:
+        return functional_call(merge, dict(zip(names, values, strict=True)), (maps, skip))
+
+    return function, [merge.get_parameter(name).detach() for name in names]
+
+
+def finished(joined: Tensor, normalise: bool) -> Tensor:
+    if normalise:
+        rest = joined - joined.mean(dim=(1, 2, 3), keepdim=True)
+        joined = rest / (rest.square().mean(dim=(1, 2, 3), keepdim=True) + 1e-5).sqrt()
+    return torch.where(joined < 0, 0.02 * joined, joined)
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_merging_maps_of_one_size_is_a_convolution_of_both_side_by_side(normalise: bool) -> None:
+    merge, weights = merging(normalise)
+    maps, skip = torch.randn(2, 3, 11, 13, dtype=torch.float64), torch.randn(2, 5, 11, 13, dtype=torch.float64)
+
+    def plain(maps: Tensor, skip: Tensor, coarse: Tensor, fine: Tensor, bias: Tensor) -> Tensor:
+        kernel = torch.cat([coarse, fine], dim=1)
+        return finished(functional.conv2d(torch.cat([maps, skip], dim=1), kernel, bias, padding=1), normalise)
+
+    assert_same(merge, plain, maps, skip, *weights)
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_merging_a_coarser_map_repeats_each_pixel_of_its_part_of_the_convolution(normalise: bool) -> None:
+    merge, weights = merging(normalise)
+    maps, skip = torch.randn(2, 3, 11, 13, dtype=torch.float64), torch.randn(2, 5, 22, 26, dtype=torch.float64)
+
+    def plain(maps: Tensor, skip: Tensor, coarse: Tensor, fine: Tensor, bias: Tensor) -> Tensor:
+        part = functional.conv2d(maps, coarse, padding=1)
+        repeated = part.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+        return finished(repeated + functional.conv2d(skip, fine, bias, padding=1), normalise)
+
+    assert_same(merge, plain, maps, skip, *weights)
 
 
 @pytest.mark.parametrize("views", [[[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]], [[1, 2], [0, 1]]])

@@ -1,9 +1,11 @@
 """Set abstraction against its definitions: farthest points, ball queries, and what each centre may depend on."""
 
+import math
 from collections.abc import Callable
 
 import pytest
 import torch
+from torch.nn import functional
 
 from lerobot_histmv.model.cameras import Workspace
 from lerobot_histmv.model.config import PointsConfig
@@ -81,17 +83,29 @@ def features() -> torch.Tensor:
     return torch.randn(N, P, C, generator=torch.Generator().manual_seed(9))
 
 
-def test_set_abstraction_equals_one_ball_at_a_time() -> None:
+def plain_ball(points: torch.Tensor, valid: torch.Tensor, centre: torch.Tensor, radius: float) -> list[int]:
+    """The at most three valid points nearest to the centre and within the radius, near to far."""
+    near = sorted((math.dist(points[i].tolist(), centre.tolist()), i) for i in range(P) if valid[i])
+    return [i for distance, i in near[:3] if distance <= radius]
+
+
+@pytest.mark.parametrize(("radius", "sizes"), [(0.05, {1}), (0.3, {1, 2, 3}), (2.0, {3})])
+def test_set_abstraction_equals_a_loop_over_centres_and_their_neighbours(radius: float, sizes: set[int]) -> None:
     points, valid = cloud()
-    centres, abstracted, kept = abstraction()(points, features(), valid)
-    balls = ball_query(centres, points, valid, 0.4, 3)
+    module, found = abstraction(radius=radius), set()
+    centres, abstracted, kept = module(points, features(), valid)
+    assert centres.equal(gather_points(points, farthest_points(points, valid, 7)))
     assert kept.all()
     for n, c in torch.cartesian_prod(torch.arange(N), torch.arange(7)).tolist():
-        ball = balls[n, c]
-        everything = torch.ones(1, len(ball), dtype=torch.bool)
-        one = abstraction(centres=1)(points[n, ball][None], features()[n, ball][None], everything)
-        torch.testing.assert_close(one[0][0, 0], centres[n, c])
-        torch.testing.assert_close(one[1][0, 0], abstracted[n, c])
+        ball = plain_ball(points[n], valid[n], centres[n, c], radius)
+        found.add(len(ball))
+        strongest = torch.full((13,), -torch.inf)
+        for i in ball:
+            row = torch.cat([(points[n, i] - centres[n, c]) / radius, features()[n, i]])
+            hidden = functional.gelu(module.first.weight @ row + module.first.bias)
+            strongest = torch.maximum(strongest, module.second.weight @ hidden + module.second.bias)
+        torch.testing.assert_close(abstracted[n, c], strongest)
+    assert found == sizes, "balls of every size that the radius allows"
 
 
 def test_invalid_points_never_matter() -> None:
