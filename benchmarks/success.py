@@ -42,11 +42,11 @@ SCENES = 100
 OUTPUT = Path("outputs/success")
 
 
-def data_stages(setting: str, folder: Path) -> list[Stage]:
-    """Record and keyframe; the seeds share what they make."""
-    task, episodes = SETTINGS[setting]
+def data_stages(setting: str, folder: Path, episodes: int | None = None) -> list[Stage]:
+    """Record and keyframe; the seeds share what they make. ``episodes`` replaces the setting's own number."""
+    task, usual = SETTINGS[setting]
     record = (
-        "histmv", "record", f"--env.task={task}", f"--episodes={episodes}", "--seed=0",
+        "histmv", "record", f"--env.task={task}", f"--episodes={episodes or usual}", "--seed=0",
         f"--repo_id=local/{setting}", f"--root={folder / 'episodes'}",
     )  # fmt: skip
     keyframe = (
@@ -68,13 +68,13 @@ def training_stage(setting: str, seed: int, folder: Path, own: Path, preset: str
     return Stage("train", title, train, resume=resume_training(train, training))
 
 
-def evaluation_stage(setting: str, policy: Path, output: Path, *scenes: str) -> Stage:
-    """Evaluate a checkpoint; ``scenes`` are further options of the environment."""
+def evaluation_stage(setting: str, policy: Path, output: Path, *scenes: str, count: int = SCENES) -> Stage:
+    """Evaluate a checkpoint on ``count`` scenes; ``scenes`` are further options of the environment."""
     command = (
         "histmv", "eval", f"--policy.path={policy}", "--env.type=ur5", f"--env.task={SETTINGS[setting][0]}", *scenes,
-        f"--eval.n_episodes={SCENES}", f"--seed={REPORTED_SEEDS}", "--videos=0", f"--output_dir={output}",
+        f"--eval.n_episodes={count}", f"--seed={REPORTED_SEEDS}", "--videos=0", f"--output_dir={output}",
     )  # fmt: skip
-    return Stage(output.name, f"evaluate on {SCENES} scenes", command)
+    return Stage(output.name, f"evaluate on {count} scenes", command)
 
 
 def anywhere(command: str, output: Path, default: Path = OUTPUT) -> str:

@@ -144,6 +144,7 @@ class Evaluation:
         """What was evaluated on which scenes."""
         return {
             "checkpoint": str(self.config.policy.path),
+            "env_type": self.config.env.type,
             "seeds": {"first": self.seeds[0], "last": self.seeds[-1]},
             "batch_size": self.config.eval.batch_size,
             "settings": self.settings,

@@ -1,22 +1,24 @@
 """The card of a trained policy: what it was trained on, what it expects and returns, and how to evaluate it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import EvalResult, ModelCard, ModelCardData
+from huggingface_hub import ModelCard, ModelCardData
 from huggingface_hub.constants import HUGGINGFACE_CO_URL_HOME
 
 import lerobot_histmv
-from lerobot_histmv import keys
+from lerobot_histmv import evaluation_text, keys
 from lerobot_histmv.calibration_text import calibration_table
+from lerobot_histmv.command_text import KEYFRAMES, TRAINING, command
 from lerobot_histmv.configuration_histmv import HistMVConfig
 
 LICENSE = "apache-2.0"
 PROJECT_TAGS = ("robotics", "lerobot", "histmv", "keyframes", "rgb-d")
 INSTRUCTIONS = 10
 """So many are printed; a policy may know hundreds."""
+INSTALL = "pip install 'lerobot_policy_histmv[sim]'"
 
 CONVENTIONS = """* World = robot base, metres, z up. Camera frame: x right, y down, z forward. Pixel (u, v)
   has its centre at (u, v).
@@ -33,7 +35,9 @@ def model_card(
     dataset_meta: Any = None,
     license: str | None = None,
     tags: Sequence[str] | None = None,
-    evaluation: Mapping[str, Any] | None = None,
+    evaluation: evaluation_text.Evaluation | None = None,
+    made: Sequence[str] = (),
+    folder: str = "",
 ) -> ModelCard:
     """Card of a policy.
 
@@ -44,23 +48,28 @@ def model_card(
         license: the Hub's name of a licence.
         tags: beside ``PROJECT_TAGS``.
         evaluation: content of an ``eval_info.json`` of ``histmv eval``, if the policy was measured.
+        made: commands that make the training data again, as ``KEYFRAMES``, if the data tell them.
+        folder: name of the checkpoint's folder, if it is handed on as such: then neither it nor its data are taken to
+            be on the Hub.
     """
+    place = folder or config.repo_id or "USER/NAME"
     data = ModelCardData(
         model_name=config.repo_id or "HistMV policy",
-        eval_results=_eval_results(evaluation) if evaluation else None,
+        eval_results=evaluation_text.hub_results(evaluation, config) if evaluation else None,
         license=license or config.license or LICENSE,
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys([*PROJECT_TAGS, *(tags or config.tags or [])])),
-        datasets=[training.dataset.repo_id] if training else None,
+        datasets=[training.dataset.repo_id] if training and not folder else None,
     )
     parts = [f"# {config.repo_id or 'HistMV policy'}", _opening(config), "## Data and training"]
-    parts.append(_training(config, training, dataset_meta))
+    parts.append(_training(config, training, dataset_meta, linked=not folder))
     if dataset_meta is not None and keys.INTRINSICS in dataset_meta.features:
         parts.append(f"## Calibration of the training data\n\n{calibration_table(dataset_meta)}")
-    parts += [f"## Conventions\n\n{CONVENTIONS}", _instructions(config)]
-    parts.append(f"## Measured success\n\n{_measured(evaluation)}")
-    parts += [_again(config, training), _evaluation(config)]
+    success = evaluation_text.measured(evaluation, config) if evaluation else "Not told; the last command measures it."
+    parts += [f"## Conventions\n\n{CONVENTIONS}", _instructions(config), f"## Measured success\n\n{success}"]
+    parts.append(f"## Training it again\n\n{_again(training, made, place, folder)}")
+    parts.append(f"## Evaluation\n\n{_evaluation(config, evaluation, place)}")
     text = "\n\n".join(parts)
     return ModelCard(f"---\n{data.to_yaml()}\n---\n\n{text}\n")
 
@@ -74,11 +83,11 @@ def _opening(config: HistMVConfig) -> str:
     )
 
 
-def _training(config: HistMVConfig, training: Any, dataset_meta: Any) -> str:
+def _training(config: HistMVConfig, training: Any, dataset_meta: Any, linked: bool) -> str:
     rows: dict[str, Any] = {}
     if training:
         name = training.dataset.repo_id
-        rows["data"] = f"[{name}]({HUGGINGFACE_CO_URL_HOME}datasets/{name})"
+        rows["data"] = f"[{name}]({HUGGINGFACE_CO_URL_HOME}datasets/{name})" if linked else f"`{name}`"
     if dataset_meta is not None:
         rows["size"] = f"{dataset_meta.total_episodes} episodes of {dataset_meta.total_frames} rows"
         rows |= _keyframing(Path(dataset_meta.root) / keys.KEYFRAMING_FILE)
@@ -109,54 +118,38 @@ def _instructions(config: HistMVConfig) -> str:
     return f"## Instructions\n\nTrained with {len(known)} instructions and their paraphrases:\n\n{listed}{rest}"
 
 
-def _eval_results(evaluation: Mapping[str, Any]) -> list[EvalResult]:
-    """The successes as the Hub's front matter tells them."""
-    return [
-        EvalResult(
-            task_type="robotics",
-            task_name=task["task"],
-            dataset_type=f"ur5/{task['task']}",
-            dataset_name=f"{task['n_episodes']} unseen scenes of {task['task']}",
-            metric_type="success_rate",
-            metric_name="success [%]",
-            metric_value=round(task["pc_success"], 1),
-        )
-        for task in evaluation["per_task"]
-    ]
-
-
-def _measured(evaluation: Mapping[str, Any] | None) -> str:
-    if not evaluation:
-        return "Not told here; the last command measures it."
-    lines = ["| task | success | 95 % interval (Wilson) | failures |", "|---|---|---|---|"]
-    for task in evaluation["per_task"]:
-        low, high = task["wilson_95"]
-        failures = ", ".join(f"{kind} {count}" for kind, count in task["failures"].items()) or "none"
-        share = f"{task['n_successes']} of {task['n_episodes']}"
-        lines.append(f"| `{task['task']}` | {share} | {low:.1f} to {high:.1f} % | {failures} |")
-    seeds = evaluation["seeds"]
-    return "\n".join([*lines, "", f"Scenes {seeds['first']} to {seeds['last']} of the environment `ur5`."])
-
-
-def _again(config: HistMVConfig, training: Any) -> str:
-    """How to train the same."""
+def _again(training: Any, made: Sequence[str], place: str, folder: str) -> str:
+    """How to train the same, from nothing if that is known."""
     if not training:
-        return "## Training it again\n\nNot told."
-    path = config.repo_id or "USER/NAME"
+        return "Not told."
+    name = training.dataset.repo_id
+    root: str | None = None
+    if made:
+        root, data = KEYFRAMES, f"the commands before it make the data, `{name}`"
+    elif folder:
+        root, data = "DATA", f"DATA is the folder of `{name}`"
+    else:
+        data = f"it reads `{name}` by this name, from LeRobot's own folder or the Hub"
+    options: dict[str, Any] = {"config_path": place, "dataset.repo_id": name, "dataset.root": root}
+    options |= {"steps": training.steps, "batch_size": training.batch_size, "seed": training.seed}
+    # A checkpoint of a resumed training says of itself that it goes on, with its own weights, in its own folder.
+    options |= {"resume": False, "policy.pretrained_path": None} if training.resume else {}
+    options |= {"policy.push_to_hub": False, "output_dir": TRAINING}
+    where = f" Run them where the folder `{folder}` lies." if folder else ""
+    commands = "\n".join([INSTALL, *made, command("lerobot-train", options)])
     return (
-        "## Training it again\n\nThe checkpoint holds the settings of its training:\n\n```bash\n"
-        f"lerobot-train --config_path={path} --dataset.root=null --policy.push_to_hub=false "
-        "--output_dir=outputs/again\n```"
+        f"The checkpoint holds all settings of the last command; {data}.{where}\n\n```bash\n{commands}\n```\n\n"
+        f"The result lies in `{TRAINING}/checkpoints/last/pretrained_model`."
     )
 
 
-def _evaluation(config: HistMVConfig) -> str:
-    path, cameras = config.repo_id or "USER/NAME", ",".join(config.cameras)
-    env = f"--env.type=ur5 --env.task=TASK --env.cameras=[{cameras}] --env.image_size={config.image_size[0]}"
+def _evaluation(config: HistMVConfig, evaluation: evaluation_text.Evaluation | None, place: str) -> str:
+    aim = "the same scenes again" if evaluation else "unseen scenes, TASK being one of those that the data shows"
+    commands = (
+        evaluation_text.evaluation_command(config, evaluation, place, program)
+        for program in ("lerobot-eval", "histmv eval")
+    )
     return (
-        "## Evaluation\n\nTo measure the success on unseen scenes, TASK being one of those that the data shows:\n\n"
-        "```bash\n"
-        "pip install 'lerobot_policy_histmv[sim]'\n"
-        f"lerobot-eval --policy.path={path} {env} --eval.n_episodes=100\n"
-        f"histmv eval --policy.path={path} {env} --eval.n_episodes=100  # with intervals and reasons of failures\n```"
+        f"To measure the success on {aim}: with LeRobot's command, or with one that adds intervals and reasons of "
+        "failures.\n\n```bash\n" + "\n".join([INSTALL, *commands]) + "\n```"
     )

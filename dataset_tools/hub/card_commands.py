@@ -1,17 +1,40 @@
-"""The command that makes a dataset again, from what the dataset tells about itself."""
+"""The commands that make a dataset again, from what the dataset tells about itself."""
 
 import json
 import re
-import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from dataset_tools.keyframes import KeyframeOptions
+from dataset_tools.replay import SOURCE_RECORDING_FILE
+from lerobot_histmv import keys
+from lerobot_histmv.command_text import DEMONSTRATIONS, KEYFRAMES, command, flat
 
 
-def record_command(told: Mapping[str, Any], repo_id: str) -> str:
-    """The ``histmv record`` command behind a ``meta/recording.json``."""
+def data_commands(root: Path, repo_id: str) -> list[str]:
+    """Commands that make the keyframed data in ``root`` again, as ``KEYFRAMES``; none if the data do not tell how.
+
+    Demonstrations that ``histmv record`` did not make are read by their name.
+    """
+    keyframing, recording = (_read(root / name) for name in (keys.KEYFRAMING_FILE, SOURCE_RECORDING_FILE))
+    if not keyframing:
+        return []
+    if not recording:
+        return [keyframe_command(keyframing, repo_id, root=KEYFRAMES)]
+    return [
+        record_command(recording, keyframing["source"], DEMONSTRATIONS),
+        keyframe_command(keyframing, repo_id, DEMONSTRATIONS, KEYFRAMES),
+    ]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def record_command(told: Mapping[str, Any], repo_id: str, root: str = "") -> str:
+    """The ``histmv record`` command behind a ``meta/recording.json``, to the folder ``root`` if one is given."""
     settings = told["settings"]
     options = {
         "env.task": ",".join(settings["tasks"]),
@@ -24,17 +47,30 @@ def record_command(told: Mapping[str, Any], repo_id: str) -> str:
     if settings["variation"] is not None:
         options["env.variation"] = settings["variation"]
     options |= {f"env.disturbances.{name}": value for name, value in settings["disturbances"].items() if value}
-    return _command("record", options | {"repo_id": repo_id})
+    return command("histmv record", options | {"repo_id": repo_id} | _places(root=root))
 
 
-def keyframe_command(told: Mapping[str, Any], repo_id: str) -> str:
-    """The ``histmv keyframe`` command behind a ``meta/keyframing.json``: its columns, and what is not usual."""
-    usual = dict(_flat(asdict(KeyframeOptions())))
-    wanted = dict(_flat(told["options"]))
+def keyframe_command(told: Mapping[str, Any], repo_id: str, source_root: str = "", root: str = "") -> str:
+    """The ``histmv keyframe`` command behind a ``meta/keyframing.json``: its columns, and what is not usual.
+
+    Args:
+        told: the file's content.
+        repo_id: name of the keyframed dataset.
+        source_root: folder of the dense one, if it is to be named.
+        root: folder to write, if it is to be named.
+    """
+    usual = dict(flat(asdict(KeyframeOptions())))
+    wanted = dict(flat(told["options"]))
     options = {"dataset.repo_id": told["source"], "output.repo_id": repo_id}
     options |= {name: wanted[name] for name in ("method", "epsilon", "seed")}
     options |= {name: value for name, value in wanted.items() if usual.get(name) != value}
-    return _command("keyframe", options | _kept(told) | _episodes(told) | _columns(told["columns"]))
+    options |= _kept(told) | _episodes(told) | _columns(told["columns"])
+    return command("histmv keyframe", options | _places(**{"dataset.root": source_root, "output.root": root}))
+
+
+def _places(**folders: str) -> dict[str, str]:
+    """Those options that name a folder."""
+    return {option: folder for option, folder in folders.items() if folder}
 
 
 def _kept(told: Mapping[str, Any]) -> dict[str, Any]:
@@ -66,21 +102,3 @@ def _columns(told: Mapping[str, str]) -> dict[str, Any]:
         else:
             options[f"columns.{name}"] = column
     return options
-
-
-def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in options.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
-
-
-def _command(name: str, options: Mapping[str, Any]) -> str:
-    words = [f"--{option}={value if isinstance(value, str) else _plain(value)}" for option, value in options.items()]
-    return " \\\n  ".join([f"histmv {name}", *map(shlex.quote, words)])
-
-
-def _plain(value: Any) -> str:
-    """As draccus reads it: JSON, but text and keys without quotes."""
-    return json.dumps(value, separators=(",", ": ")).replace('"', "")

@@ -15,6 +15,7 @@ from dataset_tools.build import default_root
 from dataset_tools.eval_checkpoint import fingerprint
 from dataset_tools.eval_results import INFO_FILE
 from dataset_tools.hub import card, repositories
+from dataset_tools.hub.card_commands import data_commands
 from dataset_tools.source import check_files, missing_files
 from lerobot_histmv import _plugin  # noqa: F401  (registers the policy)
 from lerobot_histmv.configuration_histmv import HistMVConfig
@@ -43,7 +44,8 @@ class PushConfig:
     private: bool = False
     # Results of `histmv eval` of this very checkpoint, to be told in its card: the folder of eval_info.json.
     evaluation: Path | None = None
-    # Upload; false: only write the card, to look at it or to hand the folder on in another way.
+    # Upload; false: only write the card, to look at it or to hand the folder on in another way; its commands then name
+    # the checkpoint by its folder.
     upload: bool = True
     # Licence, as the Hub names it; by default what README.md says, else apache-2.0. A keyframed dataset stays under the
     # licence of its source: say so if that is another one.
@@ -110,8 +112,10 @@ def push_checkpoint(folder: Path, given: PushConfig) -> None:
     url = repositories.prepare(given.repo_id, given.private, "model") if given.upload else ""
     if isinstance(config, HistMVConfig):
         training = TrainPipelineConfig.from_pretrained(folder) if (folder / "train_config.json").is_file() else None
-        made = model_card(config, training, training_data(training), evaluation=results)
-        _save(card.refreshed(made, folder / card.CARD_FILE, given.license), folder)
+        data, on_disk = training_data(training), "" if given.upload else folder.name
+        made = data_commands(data.root, data.repo_id) if data else []
+        written = model_card(config, training, data, evaluation=results, made=made, folder=on_disk)
+        _save(card.refreshed(written, folder / card.CARD_FILE, given.license), folder)
     if given.upload:
         repositories.upload_checkpoint(folder, given.repo_id)
         _say(f"the policy is at {url}; evaluate it with lerobot-eval --policy.path={given.repo_id}")

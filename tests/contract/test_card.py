@@ -1,28 +1,40 @@
 """Cards state how data were made, so exactly that their commands make the same again; what people wrote stays."""
 
-import hashlib
 import json
 import shlex
+import shutil
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import draccus
 import pytest
 from fake_demonstrations import CAMERAS, FAILING_SEEDS, SIZE, recorder
+from fake_ur5 import write_checkpoint
 from helpers.episodes import snapshot, write_picks
+from helpers.evaluations import TASKS, evaluated
+from helpers.keyframed import SIZE as SQUARE
 from huggingface_hub import DatasetCard, ModelCard
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.act.configuration_act import ACTConfig
 from tiny_policy import TASK, tiny_config, tiny_policy
 
 from dataset_tools import cli
-from dataset_tools.eval_results import INFO_FILE, Episode, evaluation_info
+from dataset_tools.eval_results import INFO_FILE
+from dataset_tools.eval_settings import EvaluateConfig
+from dataset_tools.evaluate import Evaluation
 from dataset_tools.hub import card
 from dataset_tools.hub.card_commands import record_command
 from dataset_tools.record import RecordConfig, checked_settings
 from dataset_tools.record_report import recording_report
+from dataset_tools.record_settings import RecordSettings
+from dataset_tools.replay import SOURCE_RECORDING_FILE
 from dataset_tools.shards import Outcome
 from lerobot_histmv import keys
+from lerobot_histmv.envs.disturbances import Disturbances
+from lerobot_histmv.evaluation_text import in_words, unusual_options
 
 KEYFRAMING = [
     "--method=exact",
@@ -124,11 +136,27 @@ def test_what_people_wrote_stays(keyed: Path) -> None:
     path.unlink()
 
 
+def trained(repo: str, root: Path | None = None, **changes: Any) -> TrainPipelineConfig:
+    """Settings of a training on such a dataset."""
+    dataset = DatasetConfig(repo, root=str(root) if root else None)
+    policy = tiny_config(repo_id="ann/policy")
+    return TrainPipelineConfig(dataset, policy=policy, steps=7, batch_size=3, seed=5, **changes)
+
+
+def commands_in(text: str, section: str) -> dict[str, list[str]]:
+    """Options of the commands in a section of a card, by program."""
+    block = text.partition(f"## {section}\n")[2].split("```")[1].removeprefix("bash").replace("\\\n", " ")
+    found = {}
+    for words in map(shlex.split, block.strip().splitlines()):
+        options = [word for word in words if word.startswith("--")]
+        found[" ".join(words[: len(words) - len(options)])] = options
+    return found
+
+
 def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) -> None:
     policy = tiny_policy(tiny_config(repo_id="ann/policy"))
-    training = SimpleNamespace(dataset=SimpleNamespace(repo_id="ann/keys"), steps=7, batch_size=3, seed=5)
     meta = LeRobotDatasetMetadata("ann/keys", keyed)
-    found = policy.generate_model_card("ann/keys", "histmv", "mit", ["mine"], cfg=training, dataset_meta=meta)
+    found = policy.generate_model_card("ann/keys", "histmv", "mit", ["mine"], trained("ann/keys", keyed), meta)
     assert isinstance(found, ModelCard)
     assert found.data["license"] == "mit"
     assert found.data["datasets"] == ["ann/keys"]
@@ -136,55 +164,143 @@ def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) ->
     for part in (
         "key poses of | ann/dense",
         "`exact`, epsilon 3 mm",
+        "datasets/ann/keys)",
         "7, batches of 3, seed 5",
         "48 x 32 pixels",
         "from camera to world",
         f"* {TASK}",
-        "lerobot-eval --policy.path=ann/policy --env.type=ur5 --env.task=TASK --env.cameras=[front,wrist]",
-        "lerobot-train --config_path=ann/policy",
         "## Calibration of the training data",
     ):
         assert part in found.text, part
+    again = commands_in(found.text, "Training it again")["lerobot-train"]
+    assert {"--config_path=ann/policy", "--dataset.repo_id=ann/keys", "--dataset.root=null"} <= set(again)
+    measure = commands_in(found.text, "Evaluation")
+    assert measure["histmv eval"] == measure["lerobot-eval"]
+    assert measure["histmv eval"][:3] == ["--policy.path=ann/policy", "--env.type=ur5", "--env.task=TASK"]
+    assert "--env.cameras=[front,wrist]" in measure["histmv eval"]
 
 
-def evaluated(folder: Path, weights: bytes) -> Path:
-    """Results of two tasks, as ``histmv eval`` writes them, of a policy with these weights."""
-    folder.mkdir()
-    finished = {
-        (task.split(".")[0], at): [
-            Episode(task, seed, seed != 23, "time" if seed == 23 else "", 3, 1.0, 1.0, TASK, 17.0, 0.5)
-            for seed in (19, 23, 29)
-        ]
-        for at, task in enumerate(("reach_target.red", "turn_tap.left"))
-    }
-    policy = {"weights_sha256": hashlib.sha256(weights).hexdigest()}
-    told = {"seeds": {"first": 19, "last": 29}, "checkpoint": "somewhere", "settings": {"policy": policy}}
-    info = evaluation_info(finished, folder, told)
-    (folder / INFO_FILE).write_text(json.dumps(info))
-    return folder
+def recorded(root: Path, repo: str) -> RecordSettings:
+    """As if ``histmv record`` had made the demonstrations of the keyframed data in ``root``."""
+    options = ["--env.task=pick_and_lift", "--seed=11", "--env.disturbances.depth=0.5", f"--repo_id={repo}"]
+    settings = checked_settings(draccus.parse(RecordConfig, args=options))
+    report = recording_report(settings, [Outcome(0, 0, "", 0, "", [], "", 1)] * 3)
+    (root / SOURCE_RECORDING_FILE).write_text(json.dumps(report))
+    return settings
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    return write_checkpoint(tmp_path / "policy", size=(SQUARE, SQUARE))
+
+
+def pushed(checkpoint: Path, *options: str) -> ModelCard:
+    """The card that ``histmv push --upload=false`` writes."""
+    cli.main(["push", "--repo_id=ann/policy", f"--root={checkpoint}", "--upload=false", *options])
+    return ModelCard.load(checkpoint / card.CARD_FILE)
+
+
+def test_handed_on_checkpoints_card_makes_data_and_training_again(
+    keyed: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = shutil.copytree(keyed, tmp_path / "data")
+    settings = recorded(data, "ann/dense")
+    training = trained("ann/keys", data, output_dir=tmp_path / "train", resume=True)
+    training.policy.pretrained_path = checkpoint
+    training.save_pretrained(checkpoint)
+    found = pushed(checkpoint)
+    assert str(tmp_path) not in (checkpoint / card.CARD_FILE).read_text()
+    assert found.data.get("datasets") is None
+    assert "huggingface.co" not in found.text
+    commands = commands_in(found.text, "Training it again")
+    assert list(commands)[1:] == ["histmv record", "histmv keyframe", "lerobot-train"]
+
+    record = draccus.parse(RecordConfig, args=commands["histmv record"])
+    assert (checked_settings(record), record.episodes, record.repo_id) == (settings, 3, "ann/dense")
+
+    monkeypatch.chdir(tmp_path)
+    assert record.root
+    shutil.copytree(keyed.parent / "dense", record.root)
+    cli.main(["keyframe", *commands["histmv keyframe"]])
+    (config_path, *words) = commands["lerobot-train"]
+    again = TrainPipelineConfig.from_pretrained(config_path.partition("=")[2], cli_args=words)
+    made, first = snapshot(Path(str(again.dataset.root))), snapshot(keyed)
+    assert all(made[name] == content for name, content in first.items() if name.startswith("data/"))
+    assert (again.dataset.repo_id, again.steps, again.batch_size, again.seed) == ("ann/keys", 7, 3, 5)
+    assert not again.resume, "the archive holds no optimizer to go on with"
+    assert again.policy.pretrained_path is None, "it starts from nothing, not from what it led to"
+    assert not again.output_dir.is_absolute() and not again.output_dir.exists()
+
+
+def test_data_that_do_not_tell_how_they_were_made_are_left_to_the_reader(checkpoint: Path, tmp_path: Path) -> None:
+    trained("ann/real", tmp_path / "gone").save_pretrained(checkpoint)
+    found = pushed(checkpoint)
+    commands = commands_in(found.text, "Training it again")
+    assert list(commands)[1:] == ["lerobot-train"]
+    assert {"--config_path=policy", "--dataset.root=DATA"} <= set(commands["lerobot-train"])
+    assert "DATA is the folder of `ann/real`" in found.text
+    assert str(tmp_path) not in found.text
 
 
 def test_policys_card_tells_measured_success_of_this_very_checkpoint(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    checkpoint = tmp_path / "policy"
-    tiny_policy().save_pretrained(checkpoint)
     files = snapshot(checkpoint)
-    given = ["push", "--repo_id=ann/policy", f"--root={checkpoint}", "--upload=false"]
-    wrong = evaluated(tmp_path / "other", b"other weights")
+    other = write_checkpoint(tmp_path / "other", seed=1, size=(SQUARE, SQUARE))
     with pytest.raises(SystemExit):
-        cli.main([*given, f"--evaluation={wrong}"])
+        pushed(checkpoint, f"--evaluation={evaluated(tmp_path / 'wrong', other)}")
     assert "whose weights are not those given" in capsys.readouterr().err
     assert snapshot(checkpoint) == files
-    results = evaluated(tmp_path / "evaluation", (checkpoint / "model.safetensors").read_bytes())
-    cli.main([*given, f"--evaluation={results}"])
-    found = ModelCard.load(checkpoint / card.CARD_FILE)
-    assert "| `turn_tap.left` | 2 of 3 | 20.8 to 93.9 % | time 1 |" in found.text
-    assert "Scenes 19 to 29" in found.text
-    assert [(one.task_name, one.metric_value) for one in found.data.eval_results] == [
-        ("reach_target.red", 66.7),
-        ("turn_tap.left", 66.7),
+    found = pushed(checkpoint, f"--evaluation={evaluated(tmp_path / 'evaluation', checkpoint)}")
+    assert "| `turn_tap.left` | 2 of 3 | 20.8 to 93.9 % | time 1 | usual |" in found.text
+    assert "Scenes 200019 to 200021 of the environment `ur5`" in found.text
+    assert [(one.task_name, one.dataset_name, one.metric_value) for one in found.data.eval_results] == [
+        ("reach_target.red", "3 unseen scenes of reach_target.red", 66.7),
+        ("turn_tap.left", "3 unseen scenes of turn_tap.left", 66.7),
     ]
+
+
+UNUSUAL: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "held-out sentences": ({"instruction_split": "held_out"}, []),
+    "control=servo; policy.control.rate=20": ({"control": "servo"}, ["--control.rate=20"]),
+    "held-out sentences; disturbances: dead_camera=1, distractors=2, camera=wrist": (
+        {
+            "instruction_split": "held_out",
+            "disturbances": Disturbances(dead_camera=1.0, distractors=2, camera="wrist"),
+        },
+        [],
+    ),
+}
+
+
+@pytest.mark.parametrize("words", UNUSUAL)
+def test_success_is_told_with_the_settings_it_was_measured_under(
+    words: str, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, overrides = UNUSUAL[words]
+    results = evaluated(tmp_path / "evaluation", checkpoint, overrides, **env)
+    found = pushed(checkpoint, f"--evaluation={results}")
+    assert found.text.count(f" | {words} |") == 2, "in every row"
+    assert {one.dataset_config for one in found.data.eval_results} == {words}
+    assert all(one.dataset_name.endswith(f"({words})") for one in found.data.eval_results)
+
+    monkeypatch.chdir(tmp_path)
+    commands = commands_in(found.text, "Evaluation")
+    assert commands["histmv eval"] == commands["lerobot-eval"]
+    again = Evaluation(EvaluateConfig.parse(commands["histmv eval"], "histmv eval"))
+    first = json.loads((results / INFO_FILE).read_text())
+    assert json.loads(json.dumps(again.settings["env"])) == first["settings"]["env"]
+    assert json.loads(json.dumps(again.settings["policy"])) == first["settings"]["policy"]
+    assert again.provenance()["seeds"] == first["seeds"]
+    assert again.config.env.task == ",".join(TASKS)
+
+
+def test_options_of_unknown_environments_are_all_told_and_paths_only_by_their_names(checkpoint: Path) -> None:
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    evaluation = {"env_type": "elsewhere", "settings": {"env": {"speed": 2.5, "scene": {"file": "/data/one/two.xml"}}}}
+    found = unusual_options(evaluation, config)
+    assert found == {"env.speed": 2.5, "env.scene.file": "two.xml"}
+    assert in_words(found) == "speed=2.5; scene.file=two.xml"
 
 
 @pytest.mark.parametrize("option", ["--upload=false", "--evaluation=results"])

@@ -120,6 +120,7 @@ def test_info_names_tasks_seeds_and_settings(checkpoint: Path, tmp_path: Path) -
     assert sum(failures.values()) + info["per_task"][0]["n_successes"] == len(SEEDS)
     assert failures.keys() <= {"wrong object", "grasp missed", "not reached"}
     assert info["settings"]["env"]["cameras"] == list(CAMERAS) and info["versions"]["lerobot"]
+    assert info["env_type"] == "fake_ur5"
 
 
 def decoded(path: Path) -> list[np.ndarray]:
