@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_model_network import assert_same, decide, in_order, replay, window
+from test_model_network import assert_same, decide, in_order, replay, walked, window
 from tiny_scene import SIZE, tiny_net, tiny_observation
 
 from lerobot_histmv.model.config import (
@@ -155,10 +155,10 @@ def test_past_steps_change_decisions_exactly_if_history_is_on(variant: str) -> N
     off = {"history": HistoryConfig(enabled=False, past_steps=4, layers=2, heads=2, skip_first=False)}
     net = tiny_net(**(VARIANTS["peer"] if variant == "peer" else {}), **(off if variant == "no history" else on))
     rows, other = window(4), window(4, seed=7)
-    names = ("rgb", "depth", "tool")
-    changed = replace(rows, **{n: torch.cat([getattr(other, n)[:3], getattr(rows, n)[3:]]) for n in names})
-    last = {n: getattr(rows, n)[3:] for n in (*names, "intrinsics", "extrinsics")}
-    alone = replace(rows, real=torch.ones(1, 1, dtype=torch.bool), **last)
+    images = {n: torch.cat([getattr(other, n)[:3], getattr(rows, n)[3:]]) for n in ("rgb", "depth")}
+    changed = replace(rows, **images, **walked(torch.cat([other.tool[:3, -1], rows.tool[3:, -1]])))
+    last = {n: getattr(rows, n)[3:] for n in ("rgb", "depth", "intrinsics", "extrinsics")}
+    alone = replace(rows, real=torch.ones(1, 1, dtype=torch.bool), **last, **walked(rows.tool[3:, -1]))
     expected = replay(net, rows).at(torch.tensor([3]))
     for past in (replay(net, changed).at(torch.tensor([3])), replay(net, alone)):
         if variant == "no history":
