@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import socket
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,11 +14,15 @@ from typing import Any
 PRELOADED = ["lerobot.scripts.lerobot_train", "lerobot_histmv.modeling_histmv"]
 """Imported once by the server that every process is forked from: these imports take longer than all the rest."""
 
+PATIENCE = 240.0
+"""How long [s] the processes may take."""
+
 
 def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: Any) -> None:
     """``function(rank, *arguments)`` in ``count`` processes that find each other as torchrun's would.
 
-    ``log`` gets what they print. AssertionError with that, if one fails.
+    ``log`` gets what they print. AssertionError with that, if one fails, or after ``PATIENCE``: a rank whose neighbour
+    has failed waits for it.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
@@ -29,9 +34,14 @@ def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: A
     ]
     for process in processes:
         process.start()
+    end = time.monotonic() + PATIENCE
     for process in processes:
+        process.join(max(0.0, end - time.monotonic()))
+    late = [process for process in processes if process.exitcode is None]
+    for process in late:
+        process.kill()
         process.join()
-    assert all(process.exitcode == 0 for process in processes), log.read_text()
+    assert all(process.exitcode == 0 for process in processes), f"{len(late)} did not end:\n{log.read_text()}"
 
 
 def _run(rank: int, count: int, port: int, log: Path, function: Callable[..., None], arguments: Sequence[Any]) -> None:
