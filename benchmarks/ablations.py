@@ -2,6 +2,8 @@
 
     python benchmarks/ablations.py --setting=push_buttons --files full mva_st --seeds 0 1 2
     python benchmarks/ablations.py --setting=pick_and_lift --files full history_st --camera=wrist --scenes dead_camera
+    python benchmarks/ablations.py --setting=reach_target --files one_view history_st --camera=wrist --scenes covered \
+        --without_failures
     python benchmarks/ablations.py --setting=pick_and_lift --files full --seeds 0 1 2 --scenes clean held_out
 
 Data are those of ``success.py``, which are recorded once, and so are its trainings: the full network is the default
@@ -37,6 +39,8 @@ SCENES: dict[str, tuple[str, ...]] = {
 }
 """Kinds of scenes; the same seeds in each, so that the rows of a table are paired. A card hides 60 or 90 % of the width
 of a camera's picture."""
+WITHOUT_FAILURES = ("--policy.augment.lost_view=0", "--policy.augment.card=0")
+"""Options of a training that never sees a camera fail."""
 
 
 def options(kind: str, camera: str) -> tuple[str, ...]:
@@ -56,8 +60,10 @@ def outcome(folder: Path) -> dict[str, Any]:
 def ablate(args: argparse.Namespace, file: str, seed: int, environment: dict[str, str]) -> None:
     """Train one file with one seed, evaluate it on every kind of scene and write down what came out."""
     folder = args.output / args.setting
-    own = folder / (f"seed_{seed}" if file == FULL else f"{file}_seed_{seed}")
-    train = training_stage(args.setting, seed, folder, own, "train/default" if file == FULL else FOLDER + file)
+    training, changed = ("without failures", WITHOUT_FAILURES) if args.without_failures else ("", ())
+    short, preset = ("", "train/default") if file == FULL else (file, FOLDER + file)
+    own = folder / "_".join(filter(None, [short, training.replace(" ", "_"), f"seed_{seed}"]))
+    train = training_stage(args.setting, seed, folder, own, preset, *changed)
     policy = last_checkpoint(own / "train")
     places = {kind: own / f"evaluation_{kind}{args.camera and '_'}{args.camera}" for kind in args.scenes}
     evaluations = [
@@ -66,7 +72,7 @@ def ablate(args: argparse.Namespace, file: str, seed: int, environment: dict[str
     run_stages([train, *evaluations], own, Console(), environment)
     state = read_state(own)
     add_result(
-        ", ".join(filter(None, [args.setting, file, f"seed {seed}", args.camera])),
+        ", ".join(filter(None, [args.setting, file, f"seed {seed}", args.camera, training])),
         {
             "demonstrations": SETTINGS[args.setting][1],
             "threads": args.threads,
@@ -85,6 +91,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["clean"])
     parser.add_argument("--camera", default="", help="that is dead or hidden; by default drawn per episode")
+    parser.add_argument("--without_failures", action="store_true", help="train without lost views and cards")
     args, environment = begin(parser, "push_buttons")
     for file in args.files:
         for seed in args.seeds:
