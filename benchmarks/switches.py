@@ -19,6 +19,7 @@ from dataset_tools.stages import read_state, run_stages
 
 RESULTS = Path(__file__).parent / "results" / "switches.json"
 AUGMENT = "--policy.augment."
+ONE_VIEW, CHOICE = "--policy.network.views.decode=one", "--policy.network.views.train_choice"
 SWITCHES: dict[str, tuple[str, ...]] = {
     "default": (),
     "constant_rate": ("--policy.final_lr_fraction=1",),
@@ -38,6 +39,8 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "past_2": ("--policy.network.history.past_steps=2",),
     "past_9": ("--policy.network.history.past_steps=9",),
     "no_heatmap_loss": ("--policy.loss.heatmap=0",),
+    "one_view": (ONE_VIEW,),
+    **{f"one_view_{choice}": (ONE_VIEW, f"{CHOICE}={choice}") for choice in ("argmax", "sampled", "expected")},
 }
 """Options of ``lerobot-train`` beside the preset."""
 
