@@ -67,7 +67,7 @@ class Disturbances:
             if getattr(self, name) > 1:
                 raise ValueError(f"disturbances.{name} is {getattr(self, name)}; it is a probability, at most 1")
         if self.occluder > 3:
-            raise ValueError(f"disturbances.occluder is {self.occluder}; at 3 the whole picture is hidden")
+            raise ValueError(f"disturbances.occluder is {self.occluder}; at 3 nine tenths of the picture are hidden")
         if self.distractors > MAX_DISTRACTORS or self.distractors != int(self.distractors):
             raise ValueError(f"disturbances.distractors is {self.distractors}; a table holds 0 to {MAX_DISTRACTORS}")
 
