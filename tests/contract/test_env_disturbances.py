@@ -183,7 +183,7 @@ def test_a_late_gripper_is_still_closing_when_the_step_ends() -> None:
         ({"lighting": "strong"}, "lighting is 'strong'; it must be a finite number"),
         ({"dead_camera": 1.5}, "probability"),
         ({"distractors": 9}, "a table holds 0 to 6"),
-        ({"occluder": 4}, "whole picture"),
+        ({"occluder": 4}, "nine tenths"),
     ],
 )
 def test_impossible_strengths_are_refused(strengths: dict[str, float], message: str) -> None:
