@@ -11,10 +11,18 @@ from helpers.keyframed import keyframed, training
 from helpers.ranks import in_ranks, lerobot_train
 from safetensors.torch import load_file
 
+from lerobot_histmv.configuration_histmv import HistMVConfig
+
 LENGTHS = (2, 3, 2)
 STEPS, STOPPED = 9, 5
 """Seven rows in batches of two are four steps of one process, or two of two processes whose last one takes rows from
 the epoch's beginning. Five steps stop both in the middle of a later epoch, nine end both in one after that."""
+
+WEIGHTS, OPTIMIZER = "pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors"
+DECAY, ROUNDING = 0.999, 0.9999
+"""Of the mean of squared gradients, in each step: it cannot fall faster."""
+MOST_RATES = 1.1
+"""Learning rates that Adam moves a weight by in a step, at most: 1.04 after nine steps (Cauchy-Schwarz), and decay."""
 
 Train = Callable[[int], Path]
 
@@ -50,11 +58,10 @@ def resumed(straight: Path, processes: int, output: Path) -> str:
     return log.read_text()
 
 
-def state(output: Path) -> dict[str, torch.Tensor]:
-    """Weights, and the optimizer's averages, at the end."""
-    last = output / f"checkpoints/{STEPS:06d}"
-    files = ("pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors")
-    return {f"{file}: {name}": value for file in files for name, value in load_file(last / file).items()}
+def state(output: Path, step: int = STEPS) -> dict[str, torch.Tensor]:
+    """Weights, and the optimizer's averages and counts, of a checkpoint."""
+    folder = output / f"checkpoints/{step:06d}"
+    return {name: value for file in (WEIGHTS, OPTIMIZER) for name, value in load_file(folder / file).items()}
 
 
 @pytest.mark.slow
@@ -72,7 +79,17 @@ def test_resumed_training_ends_bit_for_bit_as_one_without_interruption(
 @pytest.mark.slow
 @pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 1)])
 def test_checkpoints_load_on_another_number_of_processes(train: Train, before: int, after: int, tmp_path: Path) -> None:
+    """What a checkpoint holds bounds what few more steps of Adam can make of it, whatever rows they see."""
     straight = train(before)
     said = resumed(straight, after, tmp_path)
     assert f"Effective batch size: 2 x {after} = {2 * after}" in said
-    assert state(tmp_path).keys() == state(straight).keys()
+    stored, found = state(straight, STOPPED), state(tmp_path)
+    assert found.keys() == stored.keys()
+    steps, rate = STEPS - STOPPED, HistMVConfig().optimizer_lr
+    for name, value in stored.items():
+        if name.endswith("/step"):
+            assert found[name] == value + steps, name
+        elif name.endswith("/exp_avg_sq"):
+            assert (found[name] >= ROUNDING * DECAY**steps * value).all(), name
+        elif not name.endswith("/exp_avg"):
+            assert (found[name] - value).abs().max() <= MOST_RATES * steps * rate, name
