@@ -119,6 +119,7 @@ class ViewConfig:
         act: with decode="one", which view acts: the one of largest "weight" (as printed), or of largest weight times
             "certainty".
         mi_loss: "nmi" (w' NMI w with unit diagonal), "text" (Eq. 6 with a plus sign) or "literal" (Eq. 6 as printed).
+        mi_gradient: L_MI also teaches the features, not the weights alone.
         mi_dims: dimension of the fixed orthogonal projection before the Gaussian estimate.
         train_choice: with decode="one", which views are decoded in training: "argmax"; "sampled" from w; "expected"
             (all, weighted by w); "ranked" (all, mostly those that decode a step well; w learns to rank them).
@@ -128,6 +129,7 @@ class ViewConfig:
     decode: str = "all"
     act: str = "certainty"
     mi_loss: str = "nmi"
+    mi_gradient: bool = False
     mi_dims: int = 8
     train_choice: str = "ranked"
 

@@ -38,24 +38,33 @@ def gaussian_mutual_information(first: Float[Tensor, "*n s d"], second: Float[Te
     return (information - x.shape[-1] ** 2 / (2 * x.shape[-2])).clamp_min(0)
 
 
-def normalised_mutual_information(
+def mutual_information_matrix(
     maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]
 ) -> Float[Tensor, "n k k"]:
-    """NMI = sqrt(1 - exp(-2 I / e)) in [0, 1] between all pairs of views, diagonal 1 (Eq. 5).
-
-    For equal correlations of all channel pairs this is the absolute correlation.
-    """
+    """I [nat] between all pairs of views (Eq. 5), diagonal 0: what a map tells of itself has no bound."""
     samples = einsum(maps, projection, "n k d h w, d e -> n k h w e")
     samples = rearrange(samples, "n k h w e -> n k (h w) e")
     k = samples.shape[1]
     first, second = torch.triu_indices(k, k, offset=1, device=maps.device).unbind(0)
-    information = gaussian_mutual_information(samples[:, first], samples[:, second])
-    # The derivative of the root is infinite at 0: independent views must not give infinite gradients.
-    pairs = (1 - torch.exp(-2 * information / samples.shape[-1]) + 1e-12).sqrt()
-    matrix = repeat(torch.eye(k, dtype=maps.dtype, device=maps.device), "k j -> n k j", n=len(maps)).clone()
+    pairs = gaussian_mutual_information(samples[:, first], samples[:, second])
+    matrix = pairs.new_zeros(len(maps), k, k)
     matrix[:, first, second] = pairs
     matrix[:, second, first] = pairs
     return matrix
+
+
+def normalised_mutual_information(
+    maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]
+) -> Float[Tensor, "n k k"]:
+    """NMI = sqrt(1 - exp(-2 I / e)) in [0, 1] between all pairs of views, diagonal 1.
+
+    For equal correlations of all channel pairs this is the absolute correlation.
+    """
+    information = mutual_information_matrix(maps, projection)
+    # The derivative of the root is infinite at 0: independent views must not give infinite gradients.
+    shared = (1 - torch.exp(-2 * information / projection.shape[1]) + 1e-12).sqrt()
+    own = torch.eye(maps.shape[1], dtype=torch.bool, device=maps.device)
+    return shared.masked_fill(own, 1)
 
 
 def mutual_information_loss(
@@ -65,6 +74,11 @@ def mutual_information_loss(
 
     "nmi": w' M w with unit diagonal, which no single view minimises. "text": the sum over i != j with the plus sign
     that the text describes. "literal": the same with the printed minus sign, which rewards redundancy.
+
+    Args:
+        weights: w of the views.
+        matrix: what each pair shares; normalised for "nmi".
+        form: as above.
     """
     off_diagonal = matrix * (1 - torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device))
     if form == "nmi":
@@ -86,7 +100,7 @@ class ViewAttention(nn.Module):
 
     def __init__(self, config: ViewConfig, width: int, text_width: int) -> None:
         super().__init__()
-        self.form = config.mi_loss
+        self.form, self.teaches_features = config.mi_loss, config.mi_gradient
         # The softmax cancels a last bias.
         last = nn.Linear(width, 1, bias=False)
         self.score = nn.Sequential(nn.Linear(2 * width + text_width, width), nn.GELU(), last)
@@ -106,9 +120,10 @@ class ViewAttention(nn.Module):
         return rearrange(scores, "n k 1 -> n k").masked_fill(~usable, -math.inf).softmax(dim=-1)
 
     def redundancy(self, maps: Float[Tensor, "n k d h w"], weights: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
-        """L_MI per sample; gradients reach the weights only, so features cannot win by turning into noise."""
+        """L_MI per sample; without ``mi_gradient`` it teaches weights only: features cannot win by becoming noise."""
+        measure = normalised_mutual_information if self.form == "nmi" else mutual_information_matrix
         with full_precision(maps):
-            matrix = normalised_mutual_information(maps.detach().float(), self.projection)
+            matrix = measure((maps if self.teaches_features else maps.detach()).float(), self.projection)
             return mutual_information_loss(weights.float(), matrix, self.form)
 
 

@@ -149,7 +149,7 @@ def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> N
     assert (semantics.clip_pretrained, semantics.trained) == ("openai", False)
     views = network.views
     assert (views.fusion, views.decode, views.train_choice) == ("attention", "one", "argmax")
-    assert (views.mi_loss, views.act) == ("literal", "weight")
+    assert (views.mi_loss, views.mi_gradient, views.act) == ("literal", True, "weight")
     assert network.points.enabled
     assert network.history.enabled
     assert set(vars(network.decoder).values()) == {False}

@@ -1,4 +1,4 @@
-"""Figures of a tiny seeded policy: loss, gradients and an action, so that no change of the network goes unnoticed.
+"""Figures of tiny seeded policies: loss, gradients and actions, so that no change of the network goes unnoticed.
 
 ``python tests/golden/make_golden.py --overwrite`` writes them anew; CHANGELOG.md then says why they changed.
 """
@@ -16,23 +16,31 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_policy import episode, observation, stack, tiny_policy, window
 
 GOLDEN = Path(__file__).with_name("tiny_policy.json")
+SEEDS = (7, 17)
+"""The first policy keeps the gripper open, the second closes it."""
 
 
-def measure() -> dict[str, Any]:
-    """Loss and its terms without chance, gradient norms of one training step per module, and three actions."""
-    policy, rows = tiny_policy(seed=7), episode(3, seed=7)
+def gradient_figures(module: torch.nn.Module) -> list[float]:
+    """Norm of a module's gradient, and its shares of that along three fixed directions: signs and order matter."""
+    gradients = [p.grad.flatten() for p in module.parameters() if p.grad is not None]
+    if not gradients:
+        return []
+    gradient = torch.cat(gradients)
+    signs = torch.randint(2, (3, len(gradient)), generator=torch.Generator().manual_seed(0)) * 2.0 - 1
+    return [gradient.norm().item(), *(signs @ gradient / gradient.norm()).tolist()]
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """Loss and its terms without chance, gradients of one training step per module, and three actions."""
+    policy, rows = tiny_policy(seed=seed), episode(3, seed=seed)
     batch = stack([window(rows, end) for end in range(3)])
     with torch.no_grad():
         loss, log = policy(batch)
     actions = torch.cat([policy.select_action(observation(rows, step)) for step in range(3)])
-    torch.manual_seed(7)
+    torch.manual_seed(seed)
     policy.train()(batch)[0].backward()
-    norms = {
-        name: torch.cat([p.grad.flatten() for p in module.parameters() if p.grad is not None]).norm().item()
-        for name, module in policy.net.named_children()
-        if any(p.grad is not None for p in module.parameters())
-    }
-    return {"loss": loss.item(), "log": log, "gradient_norms": norms, "actions": actions.tolist()}
+    gradients = {name: gradient_figures(module) for name, module in policy.net.named_children()}
+    return {"loss": loss.item(), "log": log, "gradients": gradients, "actions": actions.tolist()}
 
 
 def main() -> None:
@@ -43,7 +51,7 @@ def main() -> None:
     if GOLDEN.exists() and not overwrite:
         raise SystemExit(f"{GOLDEN} exists; --overwrite replaces it")
     draft = GOLDEN.with_suffix(".draft")
-    draft.write_text(json.dumps(measure(), indent=1) + "\n")
+    draft.write_text(json.dumps({str(seed): measure(seed) for seed in SEEDS}, indent=1) + "\n")
     draft.replace(GOLDEN)
 
 

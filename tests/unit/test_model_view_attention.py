@@ -1,5 +1,7 @@
 """View weights: a softmax over present views, taught by fusion, redundancy and the decoding of every view."""
 
+import math
+
 import pytest
 import torch
 
@@ -71,6 +73,28 @@ def test_redundancy_teaches_weights_but_not_features(form: str) -> None:
     assert maps.grad is None, "features must not win by turning into noise"
     assert weights.grad is not None
     assert weights.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("form", ["nmi", "text", "literal"])
+def test_redundancy_teaches_features_where_asked(form: str) -> None:
+    maps, text, present = inputs()
+    module, maps = attention(mi_loss=form, mi_gradient=True), maps.requires_grad_()
+    module.redundancy(maps, module(maps.detach(), text, present)).sum().backward()
+    assert maps.grad is not None
+    assert maps.grad.isfinite().all()
+    assert maps.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize(("form", "sign"), [("text", 1), ("literal", -1)])
+def test_equation_6_sums_information_in_nats(form: str, sign: int) -> None:
+    """Gaussian views of correlation rho share I = -d/2 ln(1 - rho^2) (d = 3); one that shares nothing adds nothing."""
+    generator, rho = torch.Generator().manual_seed(0), 0.6
+    first, noise, alone = torch.randn(3, D, 101, 103, generator=generator)
+    maps = torch.stack([first, rho * first + (1 - rho**2) ** 0.5 * noise, alone])[None]
+    weights = torch.tensor([[0.5, 0.3, 0.2]])
+    found = attention(mi_loss=form).redundancy(maps, weights)
+    expected = sign * 2 * 0.5 * 0.3 * -3 / 2 * math.log(1 - rho**2)
+    assert found.item() == pytest.approx(expected, rel=0.03)
 
 
 def test_projection_does_not_depend_on_the_global_seed_and_is_orthogonal() -> None:
