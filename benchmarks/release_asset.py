@@ -5,7 +5,7 @@
 
 The first makes what a release carries, in half an hour on two cores; the second shows in minutes that everything runs.
 Killed and started again, it continues. The archive and a file with its SHA-256 lie in the output folder; the same
-checkpoint gives the same archive, byte for byte.
+checkpoint gives the same archive, byte for byte. What the first made goes to ``benchmarks/results/release_asset.json``.
 """
 
 import argparse
@@ -20,13 +20,24 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from success import SCENES, SETTINGS, command_environment, data_stages, evaluation_stage, training_stage
+from success import (
+    SCENES,
+    SETTINGS,
+    add_result,
+    anywhere,
+    command_environment,
+    data_stages,
+    evaluation_stage,
+    training_stage,
+)
 
 from dataset_tools.demo import last_checkpoint
 from dataset_tools.hub import push
 from dataset_tools.shards import write_json
-from dataset_tools.stages import Stage, run_stages, say
+from dataset_tools.stages import Stage, read_state, run_stages, say
 
+RESULTS = Path(__file__).parent / "results" / "release_asset.json"
+OUTPUT = Path("outputs/release")
 LICENSE = Path(__file__).parents[1] / "LICENSE"
 TEXTS = ("*.json", "*.md", "LICENSE")
 PLACE = re.compile(r"(?<![\w./:$}*])/(?:[\w.+-]+/)+[\w.+-]+")
@@ -128,6 +139,20 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
+def told(args: argparse.Namespace, folder: Path, archive: Path) -> dict[str, Any]:
+    """What the archive is, what its policy reached, and the commands that made it."""
+    state = read_state(folder)
+    (task,) = json.loads((folder / "evaluation" / "eval_info.json").read_text())["per_task"]
+    return {
+        "bytes": archive.stat().st_size,
+        "sha256": sha256(archive),
+        "demonstrations": SETTINGS[args.setting][1],
+        "training_minutes": round(state["train"].seconds / 60, 1),
+        **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95")},
+        "commands": [anywhere(" ".join(record.command), args.output, OUTPUT) for record in state.values()],
+    }
+
+
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -137,7 +162,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, help="demonstrations, if not as many as the setting has")
     parser.add_argument("--steps", type=int, help="of the training, if not as many as the preset has")
     parser.add_argument("--scenes", type=int, default=SCENES, help="unseen ones to evaluate on")
-    parser.add_argument("--output", type=Path, default=Path("outputs/release"), help="give it again to continue")
+    parser.add_argument("--output", type=Path, default=OUTPUT, help="give it again to continue")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="of each command")
     return parser
 
@@ -148,6 +173,8 @@ def main() -> None:
     folder = args.output / args.setting
     run_stages(stages(args, folder), folder, console, command_environment(args.threads))
     archive = pack(last_checkpoint(folder / "train"), folder / "evaluation", f"histmv_{args.setting}", args.output)
+    if not (args.episodes or args.steps) and args.scenes == SCENES:
+        add_result(f"{args.setting}, {args.preset}, seed {args.seed}", told(args, folder, archive), RESULTS)
     say(console, f"{archive}: {archive.stat().st_size / 1e6:.1f} MB\nSHA-256 {sha256(archive)}")
 
 

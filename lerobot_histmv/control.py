@@ -104,8 +104,10 @@ class HeldStep:
         """Start a macro step towards ``decision`` (``keys.POSE_NAMES``), and give the command for its first tick.
 
         Raises:
-            ValueError: the state is no pose.
+            ValueError: the decision or the state is no pose.
         """
+        if not np.isfinite(decision).all():
+            raise ValueError(f"the decision {decision.tolist()} is not finite: the robot stays where it is")
         self._set_path(self._inside(Pose(decision[:3], unit_quaternion(decision[3:7], "the decision's quaternion"))))
         self._next_gripper = float(decision[7] > 0.5)
         self._moving, self._timed_out, self._waited = True, False, 0

@@ -89,7 +89,7 @@ def _training(config: HistMVConfig, training: Any, dataset_meta: Any, linked: bo
         name = training.dataset.repo_id
         rows["data"] = f"[{name}]({HUGGINGFACE_CO_URL_HOME}datasets/{name})" if linked else f"`{name}`"
     if dataset_meta is not None:
-        rows["size"] = f"{dataset_meta.total_episodes} episodes of {dataset_meta.total_frames} rows"
+        rows["size"] = f"{dataset_meta.total_episodes} episodes, {dataset_meta.total_frames} rows in all"
         rows |= _keyframing(Path(dataset_meta.root) / keys.KEYFRAMING_FILE)
     if training:
         rows["steps"] = f"{training.steps}, batches of {training.batch_size}, seed {training.seed}"

@@ -50,9 +50,8 @@ def table(rows: Mapping[str, Any]) -> str:
 
 
 def _opening(meta: LeRobotDatasetMetadata, recording: Mapping[str, Any], keyframing: Mapping[str, Any]) -> str:
-    what = (
-        f"{meta.total_episodes} episodes of {meta.total_frames} rows in LeRobot's {meta.info.codebase_version} format"
-    )
+    rows = f"{meta.total_episodes} episodes, {meta.total_frames} rows in all"
+    what = f"{rows}, in LeRobot's {meta.info.codebase_version} format"
     robot = f" Robot: {meta.robot_type}." if meta.robot_type else ""
     if keyframing:
         source = keyframing["source"]

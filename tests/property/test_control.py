@@ -126,12 +126,15 @@ def test_a_slow_arm_is_waited_for() -> None:
 
 @pytest.mark.parametrize("component", range(8))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_measurement_that_is_not_finite_stops_with_an_error(component: int, value: float) -> None:
+def test_a_pose_that_is_not_finite_stops_with_an_error(component: int, value: float) -> None:
+    """Measured at the start, measured on the way, or decided."""
     bad = START.copy()
     bad[component] = value
     with pytest.raises(ValueError, match="not finite"):
         held(state=bad)
     step = held()
+    with pytest.raises(ValueError, match=r"the decision .* is not finite"):
+        step.begin(bad, START)
     step.begin(GOAL, START)
     with pytest.raises(ValueError, match="not finite"):
         step.output(bad)
