@@ -22,12 +22,13 @@ CHOICES = ["argmax", "sampled", "expected", "ranked"]
 
 
 def networks(folder: Path) -> dict[str, NetworkConfig]:
-    """Every way to choose views, and frozen towers, which lie outside of the policy's module tree."""
+    """Every way to fuse and to choose views, and frozen towers, which lie outside of the policy's module tree."""
     weights = folder / "clip.pt"
     torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
     return {
         "all": tiny_network(),
         **{choice: tiny_network(views=ViewConfig(decode="one", train_choice=choice)) for choice in CHOICES},
+        **{fusion: tiny_network(views=ViewConfig(fusion=fusion)) for fusion in ("mean", "tokens")},
         "weight": tiny_network(views=ViewConfig(decode="one", act="weight")),
         "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
     }
@@ -46,7 +47,7 @@ def train(policy: HistMVPolicy, batch: dict[str, Any]) -> tuple[float, dict[str,
     return loss.item(), {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
 
 
-@pytest.mark.parametrize("name", ["all", *CHOICES, "frozen"])
+@pytest.mark.parametrize("name", ["all", "mean", "tokens", *CHOICES, "frozen"])
 def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_path: Path) -> None:
     config = tiny_config(network=networks(tmp_path)[name], augment=AugmentConfig(depth_noise=0.01))
     batch = stack([window(episode(5), 4), window(episode(5), 1), window(episode(1), 0)]) | {"index": torch.arange(3)}
@@ -62,7 +63,7 @@ def test_training_elsewhere_gives_the_same_loss_and_gradients(name: str, tmp_pat
     assert_same_gradients([others[key].values for key in gradients], list(gradients.values()), list(gradients))
 
 
-@pytest.mark.parametrize("name", ["all", "ranked", "weight", "frozen"])
+@pytest.mark.parametrize("name", ["all", "mean", "tokens", "ranked", "weight", "frozen"])
 def test_acting_elsewhere_gives_the_same_actions(name: str, tmp_path: Path) -> None:
     config, rows = tiny_config(network=networks(tmp_path)[name]), episode(3)
     here = tiny_policy(config)
