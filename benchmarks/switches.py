@@ -19,6 +19,9 @@ from dataset_tools.stages import read_state, run_stages
 
 RESULTS = Path(__file__).parent / "results" / "switches.json"
 AUGMENT = "--policy.augment."
+CLIP = "--policy.network.semantics."
+OWN_CLIP = f"{CLIP}clip_pretrained=outputs/tiny_clip/tiny.pt"
+"""Weights that ``tiny_clip.py`` makes."""
 ONE_VIEW, CHOICE = "--policy.network.views.decode=one", "--policy.network.views.train_choice"
 SWITCHES: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -38,6 +41,8 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "past_1": ("--policy.network.history.past_steps=1",),
     "past_2": ("--policy.network.history.past_steps=2",),
     "past_9": ("--policy.network.history.past_steps=9",),
+    "own_clip": (OWN_CLIP, f"{CLIP}train_clip=true"),
+    "own_clip_frozen": (OWN_CLIP,),
     "no_heatmap_loss": ("--policy.loss.heatmap=0",),
     "one_view": (ONE_VIEW,),
     **{f"one_view_{choice}": (ONE_VIEW, f"{CHOICE}={choice}") for choice in ("argmax", "sampled", "expected")},
