@@ -20,12 +20,13 @@ from lerobot_histmv.control import HeldStep
 from lerobot_histmv.data.instructions import load_paraphrases, meanings
 from lerobot_histmv.model import augment, losses
 from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
 from lerobot_histmv.model.view_attention import ViewAttention, best_shares, choice_loss, ranking_loss
 from lerobot_histmv.model_card import model_card
 from lerobot_histmv.past import Past
-from lerobot_histmv.windows import Window, read_window, row_weights
+from lerobot_histmv.windows import Window, look_back, read_window
 
 Batch = dict[str, Any]
 MEANINGS = 12
@@ -141,36 +142,35 @@ class HistMVPolicy(PreTrainedPolicy):
             seen = window.observe(text)
         options = config.network.views
         choice = options.train_choice if self.training and options.decode == "one" else "best"
-        encoding, predicted, views, shares = self.net(seen, window.real, choice)
+        lookback, rows = look_back(window.real)
+        encoding, predicted, views, shares = self.net(seen, lookback, choice)
 
         step, view = views.unbind(-1)
-        target = window.target
+        target, text = window.target[lookback.decided], seen.text[lookback.decided]
         terms = losses.action_losses(predicted, target[step], self.net.heat_cloud(encoding, views), config.loss)
         # Views are judged by their actions alone: one that shows nothing near the target has no heat map loss at all.
         acted = losses.weighted_sum({name: term for name, term in terms.items() if name != "heatmap"}, config.loss)
         if choice == "ranked":
             shares = best_shares(encoding.weights.detach(), acted)
-        nothing = torch.zeros_like(seen.heat[:, 0])
+        nothing = torch.zeros_like(target[:, 0])
         share = {name: shares.detach() if name == "heatmap" else shares for name in terms}
         terms = {name: nothing.index_add(0, step, share[name] * term) for name, term in terms.items()}
         attention = self.net.view_attention
         if isinstance(attention, ViewAttention):
             terms["mutual_information"] = attention.redundancy(encoding.maps, encoding.weights)
         if choice in ("sampled", "ranked"):
-            terms["choice"] = self._choice_loss(encoding, seen.text, view, acted)
+            terms["choice"] = self._choice_loss(encoding, text, view, acted)
         if self.training and self.net.semantics.text_is_trained and self._meanings:
             terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 
-        rows = row_weights(window.real, config.network.history.past_steps)
         log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
         error = (predicted.position - target[step, :3]).norm(dim=-1)
         log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
         log |= {f"view_{name}": w.item() for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
-        if reduction == "none":
-            owner = window.real.nonzero()[:, 0]
-            return torch.zeros(len(window.real), device=per_step.device).index_add(0, owner, per_step * rows), log
-        return masked_mean(per_step, rows), log
+        owner = window.real.nonzero()[lookback.decided, 0]
+        each = torch.zeros(len(window.real), device=per_step.device).index_add(0, owner, per_step * rows)
+        return each if reduction == "none" else each.mean(), log
 
     @torch.no_grad()
     def select_action(self, batch: Batch, **_: Any) -> Float[Tensor, "b 8"]:
@@ -220,8 +220,8 @@ class HistMVPolicy(PreTrainedPolicy):
         encoding = self.net.encode(replace(window, tool=tool, heat=heat).observe(text))
         fused, real = past.add_maps(rows, encoding.fused)
         count = real.sum(dim=1)
-        enriched = self.net.remember(fused, text.repeat_interleave(count, dim=0), real)
-        predicted, views = self.net.decode_best(encoding, enriched[count.cumsum(dim=0) - 1])
+        enriched = self.net.remember(fused, text.repeat_interleave(count, dim=0), Lookback.over(real).newest())
+        predicted, views = self.net.decode_best(encoding, enriched)
         decision = self._decision(encoding, predicted, views[:, 1])
         self.last_decision = self.last_decision.updated(rows, decision) if self.last_decision else decision
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)

@@ -11,7 +11,9 @@ from torch.nn import functional
 
 from lerobot_histmv import keys
 from lerobot_histmv.model import augment
+from lerobot_histmv.model.history import Lookback, pack
 from lerobot_histmv.model.network import Observation
+from lerobot_histmv.model.rotations import multiply_quaternions
 
 MILLIMETRE = 1e-3
 HEAT_DECAY = 0.6
@@ -25,7 +27,7 @@ def causal_heat(age: Tensor) -> Tensor:
 
 @dataclass
 class Window:
-    """The n real rows of b windows of t rows, packed in row-major order.
+    """The n real rows of b neighbourhoods of t rows, packed in row-major order.
 
     Args:
         real: which rows are real; the others lie before an episode's start.
@@ -35,6 +37,7 @@ class Window:
         extrinsics: T_world_cam.
         tool: measured tool positions [m], the current one last.
         heat: their intensity, 1 now, less with age, 0 where there was none.
+        turn: measured rotation of the tool, as a quaternion.
         action: target position [m], quaternion wxyz, gripper; absent at inference.
         clip: stored semantic vectors of the views, of the images as recorded; absent if the data hold none that fit.
     """
@@ -46,6 +49,7 @@ class Window:
     extrinsics: Float[Tensor, "n k 3 4"]
     tool: Float[Tensor, "n p 3"]
     heat: Float[Tensor, "n p"]
+    turn: Float[Tensor, "n 4"]
     action: Float[Tensor, "n 8"] | None
     clip: Float[Tensor, "n k g"] | None = None
 
@@ -60,7 +64,7 @@ class Window:
         """What the network sees, each window with its instruction."""
         seen = text[self.real.nonzero()[:, 0]]
         return Observation(
-            self.rgb, self.depth, self.intrinsics, self.extrinsics, self.tool, self.heat, seen, self.clip
+            self.rgb, self.depth, self.intrinsics, self.extrinsics, self.tool, self.heat, self.turn, seen, self.clip
         )
 
     def moved(self, motion: Float[Tensor, "b 3 4"], turn: Float[Tensor, "b 4"]) -> "Window":
@@ -68,11 +72,12 @@ class Window:
         owner = self.real.nonzero()[:, 0]
         each, turns = motion[owner], turn[owner]
         points = augment.move_points(each, torch.cat([self.tool, self.target[:, None, :3]], dim=1))
-        rotated = augment.multiply_quaternions(turns, self.target[:, 3:7])
+        rotated = multiply_quaternions(turns, self.target[:, 3:7])
         return replace(
             self,
             extrinsics=augment.move_cameras(each, self.extrinsics[:, None])[:, 0],
             tool=points[:, :-1],
+            turn=multiply_quaternions(turns, self.turn),
             action=torch.cat([points[:, -1], rotated, self.target[:, 7:]], dim=-1),
         )
 
@@ -93,32 +98,35 @@ class Window:
         return replace(self, rgb=rgb, depth=depth, intrinsics=intrinsics)
 
 
-def choose_rows(exist: Bool[Tensor, "b t"]) -> tuple[Bool[Tensor, "b u"], Bool[Tensor, "b t"]]:
-    """Windows of up to s + 1 rows, and the rows they pick from the 2s + 1 rows around each drawn row.
+def look_back(exist: Bool[Tensor, "b t"]) -> tuple[Lookback, Float[Tensor, " r"]]:
+    """Windows of up to s + 1 steps for every row whose whole history is among the 2s + 1 rows around each drawn one.
 
-    A window is the first s rows of the episode if the drawn row is among them, otherwise the drawn row and the s rows
-    before it. All steps of a short episode are so learned together, instead of encoding its first rows again in
-    each of many windows.
+    The first s + 1 rows of an episode share a window: causal attention shows each its own past. A later row has its
+    own, of itself and the s rows before it.
 
     Args:
         exist: which of the rows from s before to s after the drawn one lie in its episode.
+
+    Returns:
+        The windows, and each asked row's share in the loss: over an epoch, which draws every row once, every row gets
+        a weight of 1, however many draws show it.
     """
-    before = (~exist).cumprod(dim=1).sum(dim=1, keepdim=True)
-    window = torch.arange((exist.shape[1] + 1) // 2, device=exist.device)
-    real = exist.gather(1, before + window) & ((before == 0) | (window < len(window) - 1))
-    picked = torch.zeros_like(exist).scatter(1, before + window, real)
-    return real[:, real.any(dim=0)], picked  # a column that no window has would only cost attention
-
-
-def row_weights(real: Bool[Tensor, "b u"], past_steps: int) -> Float[Tensor, " n"]:
-    """Share of each real row in its window's loss: only rows whose whole history the window shows.
-
-    The rows of an early window share evenly; of a later one, which alone has s + 1 rows, the last row counts. Over an
-    epoch, which draws every row once, every row so gets a weight of 1.
-    """
-    count = real.sum(dim=1, keepdim=True)
-    last = real.cumsum(dim=1) == count
-    return torch.where(count <= past_steps, 1 / count, last.float())[real]
+    past_steps = exist.shape[1] // 2
+    span, column = torch.arange(past_steps + 1, device=exist.device), torch.arange(exist.shape[1], device=exist.device)
+    before = (~exist).cumprod(dim=1).sum(dim=1)
+    starts = before > 0  # the episode's first row is among them
+    alone = exist & (column >= past_steps + torch.where(starts, before + 1, 0)[:, None])
+    owner = torch.cat([starts.nonzero()[:, 0], alone.nonzero()[:, 0]])
+    columns = torch.cat([before[starts], alone.nonzero()[:, 1] - past_steps])[:, None] + span
+    real = exist[owner[:, None], columns]
+    shared = (torch.arange(len(owner), device=exist.device) < starts.sum())[:, None]
+    asked = real & (shared | (span == past_steps))
+    # Each of the first s rows is shown by all draws among these; any later one by the draws of itself and the s before.
+    early = exist[owner].sum(dim=1)[:, None].clamp_max(past_steps)
+    draws = torch.where(shared & (span < past_steps), early, past_steps + 1)
+    shown = real.any(dim=0)  # a column that no window has would only cost attention
+    rows, real, asked, draws = (each[:, shown] for each in (pack(exist)[owner[:, None], columns], real, asked, draws))
+    return Lookback(rows, real, asked), 1 / draws[asked]
 
 
 def past_tools(
@@ -156,15 +164,17 @@ def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None
     if missing:
         raise ValueError(f"observation lacks {missing}; the policy was made for the cameras {cameras}")
     state = batch[keys.STATE]
-    picked = real = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
-    tools, heat = state[:, None, None, :3], torch.ones_like(state[:, None, :1])
-    if state.ndim == 3:
+    real = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
+    tools, heat = state[:, None, :3], torch.ones_like(state[:, :1])
+    windowed = state.ndim == 3
+    if windowed:
         exist, rows = ~batch[f"{keys.STATE}_is_pad"], batch[keys.INTRINSICS].shape[1]
-        real, picked = choose_rows(exist[:, -rows:])
+        real = exist[:, -rows:]
         tools, heat = past_tools(state, exist, rows)
+        tools, heat, state = tools[real], heat[real], state[:, -rows:][real]
 
     def pick(key: str) -> Tensor:
-        return batch[key][picked] if state.ndim == 3 else batch[key]
+        return batch[key][real] if windowed else batch[key]
 
     depth = torch.stack([pick(keys.depth_key(camera)) for camera in cameras], dim=1)
     vectors = [keys.clip_key(stored_as, camera) for camera in cameras] if stored_as else []
@@ -175,8 +185,9 @@ def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None
         depth=MILLIMETRE * rearrange(depth, "n k 1 y x -> n k y x"),
         intrinsics=rearrange(pick(keys.INTRINSICS), "n (k c) -> n k c", c=4),
         extrinsics=rearrange(pick(keys.EXTRINSICS), "n (k i j) -> n k i j", i=3, j=4),
-        tool=tools[picked],
-        heat=heat[picked],
+        tool=tools,
+        heat=heat,
+        turn=functional.normalize(state[:, 3:7], dim=-1),
         action=pick(keys.ACTION) if batch.get(keys.ACTION) is not None else None,
         clip=torch.stack([pick(key) for key in vectors], dim=1) if stored else None,
     )

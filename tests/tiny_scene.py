@@ -75,5 +75,6 @@ def tiny_observation(n: int, k: int, text_width: int, seed: int = 0) -> Observat
         extrinsics=extrinsics.expand(n, k, 3, 4),
         tool=tool,
         heat=torch.ones(n, 1),
+        turn=torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=-1),
         text=text,
     )

@@ -74,21 +74,6 @@ def move_cameras(motion: Float[Tensor, "b 3 4"], extrinsics: Float[Tensor, "b t 
     return moved
 
 
-def multiply_quaternions(first: Float[Tensor, "*n 4"], second: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Hamilton product (w, x, y, z): the rotation ``second`` followed by ``first``."""
-    w, x, y, z = first.unbind(-1)
-    a, b, c, d = second.unbind(-1)
-    return torch.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        dim=-1,
-    )
-
-
 def shift_pixels(
     rgb: Float[Tensor, "n k 3 y x"], depth: Float[Tensor, "n k y x"], intrinsics: Float[Tensor, "n k 4"], most: int
 ) -> tuple[Float[Tensor, "n k 3 y x"], Float[Tensor, "n k y x"], Float[Tensor, "n k 4"]]:

@@ -188,11 +188,14 @@ class DecoderConfig:
     """Parts of the decoders that the paper does not have (3.4).
 
     Args:
+        tool_frame: rotation is the sum of a part in the world's axes and one in the tool's, six numbers each, and not a
+            quaternion: to keep the tool's rotation then is a constant.
         ray: a number of its own moves the key pose along the camera's ray, beside the offset.
         local: rotation, offset and gripper also see the decoded map where the heat map points.
         peak: when acting, the position is the heat map's expectation near its peak instead of over all pixels.
     """
 
+    tool_frame: bool = True
     ray: bool = True
     local: bool = True
     peak: bool = True
@@ -206,6 +209,8 @@ class LossConfig:
         action: lambda_1, weight of position + rotation + gripper.
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
+        approach: factor on distances along the tool's z axis when the pixels nearest the target are sought: a pose over
+            an object is about that object, not about a gripper at its side. 1 measures all directions alike.
         choice: weight of the term that teaches the view weights which view decodes best.
         paraphrase: weight of the term that teaches a trained text tower which sentences mean the same.
         gripper: "bce" or "mse" (as printed).
@@ -215,6 +220,7 @@ class LossConfig:
     action: float = 1.0
     mutual_information: float = 0.01
     heatmap: float = 0.5
+    approach: float = 0.5
     choice: float = 0.1
     paraphrase: float = 1.0
     gripper: str = "bce"
@@ -222,6 +228,8 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         require("loss.gripper", self.gripper, ("bce", "mse"))
+        if not 0 < self.approach <= 1:
+            raise ValueError(f"loss.approach={self.approach} is a factor and must be above 0 and at most 1")
 
 
 @dataclass(frozen=True)

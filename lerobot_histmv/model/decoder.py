@@ -11,6 +11,7 @@ from torch.nn import functional
 from lerobot_histmv.model.cameras import squared_distances
 from lerobot_histmv.model.config import DecoderConfig
 from lerobot_histmv.model.layers import ConvBlock, full_precision, group_norm, resize_bilinear, upsample_to
+from lerobot_histmv.model.rotations import turned_with
 
 TEMPERATURE = 0.1
 LEAST_WEIGHT = 1e-6
@@ -118,7 +119,7 @@ class PositionDecoder(nn.Module):
 
 
 class PoseDecoder(nn.Module):
-    """Two convolutions, pooling and two dense layers: offset, quaternion, gripper and, with ``ray``, depth.
+    """Two convolutions, pooling and two dense layers: offset, rotation, gripper and, with ``ray``, depth.
 
     Beside the paper's pooled map, the dense layers see with ``local`` the decoded map where the heat map points: the
     turn of an object and the way from its surface to its centre are local.
@@ -128,7 +129,8 @@ class PoseDecoder(nn.Module):
         super().__init__()
         self.local = config.local
         self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
-        seen, numbers = 4 * width + LOCAL_CHANNELS * config.local, 8 + config.ray
+        self.sizes = [3, 12 if config.tool_frame else 4, 1, int(config.ray)]
+        seen, numbers = 4 * width + LOCAL_CHANNELS * config.local, sum(self.sizes)
         self.dense = nn.Sequential(nn.Linear(seen, 2 * width), nn.GELU(), nn.Linear(2 * width, numbers))
 
     def forward(
@@ -180,6 +182,7 @@ class Decoder(nn.Module):
         cloud: Float[Tensor, "m 3 y x"],
         valid: Bool[Tensor, "m y x"],
         eye: Float[Tensor, "m 3"],
+        tool: Float[Tensor, "m 3 3"],
     ) -> Prediction:
         """Decode (step, view) pairs, each from the pixels of its view.
 
@@ -190,10 +193,11 @@ class Decoder(nn.Module):
             cloud: world coordinates of the view's pixels [m].
             valid: pixels with a measurement inside the workspace.
             eye: position of the view's camera [m].
+            tool: rotation matrix of the tool at that step.
         """
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
         place = self._locate(logits, cloud, valid)
-        return self._predict(place, maps, view, decoded, eye)
+        return self._predict(place, maps, view, decoded, eye, tool)
 
     def together(
         self,
@@ -203,6 +207,7 @@ class Decoder(nn.Module):
         cloud: Float[Tensor, "n k 3 y x"],
         valid: Bool[Tensor, "n k y x"],
         eyes: Float[Tensor, "n k 3"],
+        tool: Float[Tensor, "n 3 3"],
         weights: Float[Tensor, "n k"],
     ) -> tuple[Prediction, Float[Tensor, "n k"]]:
         """Decode all views of each step with one softmax over the pixels of all; also each view's share of the heat.
@@ -228,6 +233,7 @@ class Decoder(nn.Module):
             einsum(shares, views, "n k, n k d h w -> n d h w"),
             rearrange(decoded, "(n k) c y x -> n c (k y) x", k=k),
             einsum(shares, eyes, "n k, n k c -> n c"),
+            tool,
         )
         return predicted, shares
 
@@ -250,22 +256,28 @@ class Decoder(nn.Module):
         view: Float[Tensor, "m d h w"],
         decoded: Float[Tensor, "m c y4 x4"],
         eye: Float[Tensor, "m 3"],
+        tool: Float[Tensor, "m 3 3"],
     ) -> Prediction:
         """The action at a place.
 
         A view sees the near side of an object, its centre lies deeper along the ray: that part of the way from surface
-        to key pose turns with the camera and has a number of its own beside the offset in the world's axes.
+        to key pose turns with the camera and has a number of its own beside the offset in the world's axes. Likewise,
+        rotation has a part in the tool's axes: many motions keep it, whatever it is.
         """
         numbers = self.pose(maps, view, decoded, place.heat.detach()).float()
-        offset = numbers[:, :3]
-        if self.config.ray:
-            with full_precision(numbers):
-                offset = offset + numbers[:, 8:] * functional.normalize(place.surface - eye, dim=-1)
+        with full_precision(numbers):
+            offset, turn, gripper, along = numbers.split(self.pose.sizes, dim=-1)
+            if self.config.ray:
+                offset = offset + along * functional.normalize(place.surface - eye, dim=-1)
+            if self.config.tool_frame:
+                quaternion = turned_with(tool, turn)
+            else:
+                quaternion = functional.normalize(turn, dim=-1, eps=1e-6)
         return Prediction(
             position=place.surface + OFFSET_UNIT * offset,
             surface=place.surface,
-            quaternion=functional.normalize(numbers[:, 3:7], dim=-1, eps=1e-6),
-            gripper=numbers[:, 7],
+            quaternion=quaternion,
+            gripper=gripper[:, 0],
             log_heat=place.log_heat,
             certainty=place.certainty,
         )

@@ -1,5 +1,7 @@
 """History-sensitive transformer: patches of a step attend to patches of that step and of past steps (paper 3.4)."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from einops import rearrange, repeat
 from jaxtyping import Bool, Float, Int
@@ -8,6 +10,40 @@ from torch.nn import functional
 
 from lerobot_histmv.model.config import HistoryConfig
 from lerobot_histmv.model.layers import Modulation
+
+
+@dataclass(frozen=True)
+class Lookback:
+    """Which of n steps the m windows of attention hold, and whose decisions they give.
+
+    Args:
+        rows: the steps of a window, old to new; any number where there is none.
+        real: where there is one.
+        asked: steps whose history-enriched map is wanted from this window.
+    """
+
+    rows: Int[Tensor, "m t"]
+    real: Bool[Tensor, "m t"]
+    asked: Bool[Tensor, "m t"]
+
+    @property
+    def decided(self) -> Int[Tensor, " r"]:
+        """The steps whose maps come out, in their order."""
+        return self.rows[self.asked]
+
+    @classmethod
+    def over(cls, real: Bool[Tensor, "m t"]) -> "Lookback":
+        """Windows whose real steps lie packed in row-major order; all are asked for."""
+        return cls(pack(real), real, real)
+
+    def newest(self) -> "Lookback":
+        """The same windows, each asked for its last step only."""
+        return replace(self, asked=self.real & (step_index(self.real) == self.real.sum(dim=1, keepdim=True) - 1))
+
+
+def pack(real: Bool[Tensor, "m t"]) -> Int[Tensor, "m t"]:
+    """Number of each real step when those alone are kept, in row-major order."""
+    return (real.flatten().cumsum(dim=0) - 1).clamp_min(0).view_as(real)
 
 
 class SelfAttentionBlock(nn.Module):

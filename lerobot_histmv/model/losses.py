@@ -1,6 +1,7 @@
 """Named loss terms and their weighted sum (paper Eq. 9)."""
 
 import torch
+from einops import einsum
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
@@ -8,6 +9,7 @@ from torch.nn import functional
 from lerobot_histmv.model.cameras import squared_distances
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.rotations import matrix_of
 
 HEAT_SIGMA = 0.015
 """Width [m] of the heat map's target around the surface point nearest the true position."""
@@ -23,14 +25,31 @@ def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"
 
 
 def heat_loss(
-    log_heat: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"], target: Float[Tensor, "m 3"]
+    log_heat: Float[Tensor, "m y x"],
+    cloud: Float[Tensor, "m 3 y x"],
+    target: Float[Tensor, "m 7"],
+    approach: float = 1.0,
 ) -> Float[Tensor, " m"]:
     """Cross-entropy to a Gaussian around the surface nearest the target; 0 where the view sees nothing near it.
 
-    Many key poses lie in free space, above the object that they are about: it is the nearest surface.
+    Many key poses lie in free space, above the object that they are about: it is the nearest surface. Where the gripper
+    that moves there is nearer, it is not, unless distances along the pose's approach axis count less.
+
+    Args:
+        log_heat: log-probabilities of the pixels.
+        cloud: their world coordinates [m].
+        target: position [m] and quaternion wxyz of the key pose.
+        approach: factor on distances along the pose's z axis.
     """
     seen = log_heat > -torch.inf
-    distance = squared_distances(cloud, target).masked_fill_(~seen, torch.inf).flatten(1)
+    distance = squared_distances(cloud, target[:, :3])
+    if approach != 1:
+        axis = matrix_of(target[:, 3:])[..., 2]
+        along = (
+            einsum(axis, cloud, "m c, m c y x -> m y x") - einsum(axis, target[:, :3], "m c, m c -> m")[:, None, None]
+        )
+        distance = distance - (1 - approach**2) * along.square()
+    distance = distance.masked_fill_(~seen, torch.inf).flatten(1)
     near = distance.amin(dim=1) < HEAT_REACH**2
     wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
     log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
@@ -76,7 +95,7 @@ def action_losses(
         "gripper": gripper,
     }
     if config.heatmap > 0:
-        terms["heatmap"] = heat_loss(predicted.log_heat, cloud, target[:, :3])
+        terms["heatmap"] = heat_loss(predicted.log_heat, cloud, target[:, :7], config.approach)
     return terms
 
 

@@ -13,9 +13,10 @@ from lerobot_histmv.model.config import NetworkConfig
 from lerobot_histmv.model.decoder import Decoder, Prediction
 from lerobot_histmv.model.features import POSE_STRIDE, STRIDE, RgbaFeatures
 from lerobot_histmv.model.fusion import TransFuse
-from lerobot_histmv.model.history import History
+from lerobot_histmv.model.history import History, Lookback
 from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.points import PointEncoder
+from lerobot_histmv.model.rotations import matrix_of
 from lerobot_histmv.model.semantics import Semantics
 from lerobot_histmv.model.view_attention import (
     EvenViews,
@@ -38,6 +39,7 @@ class Observation:
         extrinsics: T_world_cam.
         tool: current and past tool positions in the base frame [m].
         heat: intensity of each tool position, 1 now, less with age, 0 where absent.
+        turn: current rotation of the tool, as a unit quaternion w, x, y, z.
         text: instruction vectors.
         clip: semantic vector of each view, if it is stored with the data; else the image tower gives it.
     """
@@ -48,6 +50,7 @@ class Observation:
     extrinsics: Float[Tensor, "n k 3 4"]
     tool: Float[Tensor, "n p 3"]
     heat: Float[Tensor, "n p"]
+    turn: Float[Tensor, "n 4"]
     text: Float[Tensor, "n c"]
     clip: Float[Tensor, "n k g"] | None = None
 
@@ -65,6 +68,7 @@ class Encoding:
         valid: pixels with a measurement inside the workspace.
         weights: view weights w; equal ones where view attention is off.
         eyes: position of every camera [m].
+        tool: rotation matrix of the tool.
     """
 
     fused: Float[Tensor, "n d kh w"]
@@ -75,6 +79,17 @@ class Encoding:
     valid: Bool[Tensor, "n k y x"]
     weights: Float[Tensor, "n k"]
     eyes: Float[Tensor, "n k 3"]
+    tool: Float[Tensor, "n 3 3"]
+
+    def at(self, steps: Int[Tensor, " r"]) -> "Encoding":
+        """The given steps; the same tensors where they are all, in order."""
+        n, k = self.weights.shape
+        everything = torch.arange(n, device=steps.device)
+        if steps.equal(everything):
+            return self
+        images = rearrange(steps[:, None] * k + everything.new_tensor(range(k)), "r k -> (r k)")
+        own = {name: values[steps] for name, values in vars(self).items() if name != "skips"}
+        return Encoding(**own, skips=[skip[images] for skip in self.skips])
 
 
 def pick_images(images: Shaped[Tensor, "nk *s"], views: Int[Tensor, "m 2"], k: int) -> Shaped[Tensor, "m *s"]:
@@ -116,14 +131,16 @@ class HistMVNet(nn.Module):
         self.config = config
 
     def forward(
-        self, seen: Observation, real: Bool[Tensor, "b t"], choice: str
+        self, seen: Observation, lookback: Lookback, choice: str
     ) -> tuple[Encoding, Prediction, Int[Tensor, "m 2"], Float[Tensor, " m"]]:
-        """Encode the real steps of b windows and decode them from the views that ``choice`` picks, or from the "best".
+        """Encode all steps and decode those asked for from the views that ``choice`` picks, or from the "best".
 
-        Returns the encoding, the decoded (step, view) pairs, the pairs, and each pair's share of its step's loss.
+        Returns the encoding of the steps asked for, the decoded (step, view) pairs, the pairs, which count these steps,
+        and each pair's share of its step's loss.
         """
         encoding = self.encode(seen)
-        enriched = self.remember(encoding.fused, seen.text, real)
+        enriched = self.remember(encoding.fused, seen.text, lookback)
+        encoding = encoding.at(lookback.decided)
         if choice == "best":
             predicted, views = self.decode_best(encoding, enriched)
             return encoding, predicted, views, torch.ones_like(predicted.certainty)
@@ -140,6 +157,7 @@ class HistMVNet(nn.Module):
             # Only the current position has the full heat of 1: without memory the others go out.
             heat = seen.heat if self.config.history.memory else seen.heat.floor()
             poses = pose_heat_map(pixels, depths, heat, cells, POSE_STRIDE)
+            tool = matrix_of(seen.turn)
 
         meanings = self.semantics.images(seen.rgb) if seen.clip is None else seen.clip
         features, skips = self.rgba(seen.rgb, scaled, poses, meanings, seen.text)
@@ -149,18 +167,18 @@ class HistMVNet(nn.Module):
             maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
         fused = self.fuse(maps, weights)
-        return Encoding(fused, maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3])
+        return Encoding(fused, maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3], tool)
 
     def remember(
-        self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], real: Bool[Tensor, "b t"]
-    ) -> Float[Tensor, "n d kh w"]:
-        """History-enriched maps of the n real steps of b windows; ``n = real.sum()``, in row-major order."""
+        self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], lookback: Lookback
+    ) -> Float[Tensor, "r d kh w"]:
+        """History-enriched maps of the r steps asked for, from all n."""
         if not self.config.history.memory:  # every step is a window of its own
-            real = real.new_ones(len(fused), 1)
-        window = fused.new_zeros(*real.shape, *fused.shape[1:])
-        window[real] = fused
-        last = real.sum(dim=1).cumsum(dim=0) - 1
-        return self.history(window, text[last], real)[real]
+            decided = lookback.decided
+            lookback = Lookback.over(torch.ones_like(decided, dtype=torch.bool)[:, None])
+            fused, text = fused[decided], text[decided]
+        last = (lookback.rows * lookback.real).amax(dim=1)
+        return self.history(fused[lookback.rows], text[last], lookback.real)[lookback.asked]
 
     def decode(self, encoding: Encoding, enriched: Float[Tensor, "n d h w"], views: Int[Tensor, "m 2"]) -> Prediction:
         """Decode (step, view) pairs given as rows of ``views``."""
@@ -172,6 +190,7 @@ class HistMVNet(nn.Module):
             pick(encoding.cloud.flatten(0, 1)),
             pick(encoding.valid.flatten(0, 1)),
             pick(encoding.eyes.flatten(0, 1)),
+            encoding.tool[views[:, 0]],
         )
 
     def decode_best(
@@ -209,6 +228,7 @@ class HistMVNet(nn.Module):
             encoding.cloud,
             encoding.valid,
             encoding.eyes,
+            encoding.tool,
             encoding.weights,
         )
         steps = torch.arange(len(shares), device=shares.device)

@@ -28,6 +28,7 @@ from dataset_tools.explain.watch import Record, watched
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import project
 from lerobot_histmv.model.config import ViewConfig
+from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 from lerobot_histmv.windows import read_window
 
@@ -131,7 +132,7 @@ def test_records_equal_the_whole_window(policy: HistMVPolicy, acted: tuple[torch
         for layer in policy.net.history.layers
     ]
     with torch.no_grad():
-        encoding, predicted, *_ = policy.net(seen, whole.real, "best")
+        encoding, predicted, *_ = policy.net(seen, Lookback.over(whole.real[:, :STEPS]), "best")
         redundancy = policy.net.view_attention.redundancy(encoding.maps, encoding.weights)
     for hook in hooks:
         hook.remove()

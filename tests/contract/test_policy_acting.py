@@ -12,8 +12,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import canonical
+from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.modeling_histmv import HistMVPolicy
-from lerobot_histmv.windows import read_window
+from lerobot_histmv.windows import look_back, read_window
 
 LONG = 5
 """Steps of an episode that fits into one window."""
@@ -45,10 +46,10 @@ def test_action_is_a_canonical_pose_in_the_workspace_and_a_gripper_command(
 def whole_window(policy: HistMVPolicy, rows: dict[str, torch.Tensor], steps: int) -> Any:
     """Predictions for every step of the window before ``steps``, encoded and decoded at once, as training does it."""
     window = read_window(window_of(rows, steps - 1, LONG - 1), policy.config.cameras)
-    assert window.real.shape == (1, min(steps, LONG))
+    assert window.real.sum() == min(steps, LONG)
     seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
     with torch.no_grad():
-        return policy.net(seen, window.real, "best")
+        return policy.net(seen, Lookback.over(window.real), "best")
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, LONG])
@@ -75,6 +76,21 @@ def test_cached_decisions_equal_those_of_the_last_window_of_a_long_episode(polic
     quaternion = torch.from_numpy(canonical(predicted.quaternion[-1:].numpy())).float()[0]
     torch.testing.assert_close(action[3:7], quaternion, atol=1e-5, rtol=0)
     assert bool(action[7]) == bool(predicted.gripper[-1] > 0)
+
+
+def test_training_learns_the_decisions_that_acting_makes(policy: HistMVPolicy) -> None:
+    """Around a row amid a long episode: of all rows whose history is there, and of these only."""
+    drawn, steps = LONG, 3 * LONG
+    rows = episode(steps)
+    actions = act(policy, rows, steps)
+    window = read_window(window_of(rows, drawn, LONG - 1), policy.config.cameras)
+    lookback, _ = look_back(window.real)
+    seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
+    with torch.no_grad():
+        predicted = policy.net(seen, lookback, "best")[1]
+    learned = drawn - (LONG - 1) + lookback.decided
+    assert learned.tolist() == list(range(drawn, drawn + LONG))
+    torch.testing.assert_close(predicted.position, actions[learned, :3], atol=1e-5, rtol=0)
 
 
 def test_decisions_far_beyond_the_window_stay_finite_and_forget_the_oldest_step(policy: HistMVPolicy) -> None:

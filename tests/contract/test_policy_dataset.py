@@ -16,7 +16,7 @@ from tiny_scene import SIZE, tiny_network
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
-from lerobot_histmv.windows import choose_rows, row_weights
+from lerobot_histmv.windows import look_back
 
 REPO, LENGTHS, PAST_STEPS = "local/tiny", (1, 3, 5), 2
 
@@ -66,9 +66,10 @@ def test_rows_come_with_their_neighbours_and_every_row_with_a_target(batch: dict
 
 
 def test_every_row_of_the_dataset_counts_once(batch: dict[str, Any]) -> None:
-    real, picked = choose_rows(~batch[f"{keys.STATE}_is_pad"])
-    rows = (batch["index"][:, None] + torch.arange(-PAST_STEPS, PAST_STEPS + 1))[picked]
-    total = torch.zeros(sum(LENGTHS)).index_add(0, rows, row_weights(real, PAST_STEPS))
+    exist = ~batch[f"{keys.STATE}_is_pad"]
+    lookback, shares = look_back(exist)
+    rows = (batch["index"][:, None] + torch.arange(-PAST_STEPS, PAST_STEPS + 1))[exist][lookback.decided]
+    total = torch.zeros(sum(LENGTHS)).index_add(0, rows, shares)
     torch.testing.assert_close(total, torch.ones(sum(LENGTHS)))
 
 

@@ -105,14 +105,16 @@ def test_contents_of_padding_do_not_matter() -> None:
     torch.testing.assert_close(policy(batch)[0], expected)
 
 
-def test_loss_per_window_averages_to_the_loss_when_windows_have_equally_many_rows() -> None:
-    policy, rows = tiny_policy(), episode(5)
-    batch = stack([window(rows, end) for end in (2, 3, 4)])
+def test_loss_per_drawn_row_averages_to_the_loss() -> None:
+    """However many rows a draw teaches."""
+    policy, rows = tiny_policy(), episode(7)
+    batch = stack([window(rows, end) for end in (0, 3, 6)])
     mean, _ = policy(batch)
     each, _ = policy(batch, reduction="none")
     assert each.shape == (3,)
     torch.testing.assert_close(each.mean(), mean)
     torch.testing.assert_close(each[1], policy(window(rows, 3))[0])
+    torch.testing.assert_close(each[2], policy(window(rows, 6))[0])
 
 
 def test_episodes_of_one_row_train() -> None:
@@ -134,14 +136,16 @@ def test_loss_of_an_episode_that_fits_into_a_window_does_not_depend_on_the_drawn
         torch.testing.assert_close(policy(window(rows, drawn, past_steps=3))[0], expected)
 
 
-def test_late_windows_teach_their_last_row_only() -> None:
-    """Later rows of the episode, and targets of rows whose history the window cuts off, change nothing."""
-    policy, rows, other = tiny_policy(), episode(7), episode(7)
+def test_a_late_draw_teaches_its_row_and_those_after_it() -> None:
+    """Targets of rows whose history the draw cuts off change nothing."""
+    policy, rows, other = tiny_policy(), episode(9), episode(9)
     expected, _ = policy(window(rows, 4))
-    other[keys.ACTION][[2, 3, 5, 6]] += 0.1
+    other[keys.ACTION][[2, 3, 7, 8]] += 0.1
     torch.testing.assert_close(policy(window(other, 4))[0], expected)
-    other[keys.ACTION][4] += 0.1
-    assert policy(window(other, 4))[0] != expected
+    for row in (4, 5, 6):
+        other = episode(9)
+        other[keys.ACTION][row] += 0.1
+        assert policy(window(other, 4))[0] != expected
 
 
 def test_training_draws_among_paraphrases_and_evaluation_does_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from lerobot_histmv.model.config import HistoryConfig, PointsConfig, ViewConfig
 from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.model.network import HistMVNet, Observation
 from lerobot_histmv.windows import Window, past_tools
 
@@ -25,10 +26,15 @@ def assert_same(first: Prediction, second: Prediction, rows: slice | torch.Tenso
         )
 
 
+def unrelated(steps: int) -> Lookback:
+    """Steps without a past."""
+    return Lookback.over(torch.ones(steps, 1, dtype=torch.bool))
+
+
 def decide(net: HistMVNet, seen: Observation) -> tuple[torch.Tensor, Prediction, torch.Tensor]:
     """View weights, prediction from the best view, and that view, of unrelated steps."""
     with torch.no_grad():
-        encoding, predicted, views, _ = net(seen, torch.ones(len(seen.depth), 1, dtype=torch.bool), "best")
+        encoding, predicted, views, _ = net(seen, unrelated(len(seen.depth)), "best")
     return encoding.weights, predicted, views[:, 1]
 
 
@@ -52,7 +58,7 @@ def test_the_view_that_acts_has_the_largest_product_of_weight_and_certainty() ->
     seen = tiny_observation(n, k, net.semantics.text_width)
     with torch.no_grad():
         encoding = net.encode(seen)
-        enriched = net.remember(encoding.fused, seen.text, torch.ones(n, 1, dtype=torch.bool))
+        enriched = net.remember(encoding.fused, seen.text, unrelated(n))
         every = net.decode(encoding, enriched, torch.cartesian_prod(torch.arange(n), torch.arange(k)))
         best, views = net.decode_best(encoding, enriched)
     worth = encoding.weights * every.certainty.view(n, k)
@@ -151,6 +157,7 @@ def window(steps: int, seed: int = 0, k: int = 2) -> Window:
         intrinsics=intrinsics.expand(steps, k, 4),
         extrinsics=extrinsics.expand(steps, k, 3, 4),
         **walked(SEEN + 0.2 * torch.randn(steps, 3, generator=generator)),
+        turn=torch.nn.functional.normalize(torch.randn(steps, 4, generator=generator), dim=-1),
         action=None,
     )
 
@@ -159,7 +166,7 @@ def replay(net: HistMVNet, rows: Window) -> Prediction:
     """Predictions of every real row."""
     text = net.semantics.text(["lift the cube"] * len(rows.real), torch.device("cpu"))
     with torch.no_grad():
-        return net(rows.observe(text), rows.real, "best")[1]
+        return net(rows.observe(text), Lookback.over(rows.real), "best")[1]
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["first two alone", "all history"])
@@ -203,7 +210,7 @@ def test_windows_of_different_length_do_not_mix(remembering: HistMVNet) -> None:
     real = torch.cat([long.real, torch.tensor([[False] * 3 + [True] * 2])])
     room = long.tool.shape[1] - short.tool.shape[1]
     short = replace(short, tool=pad(short.tool, (0, 0, room, 0)), heat=pad(short.heat, (room, 0)))
-    names = ("rgb", "depth", "intrinsics", "extrinsics", "tool", "heat")
+    names = ("rgb", "depth", "intrinsics", "extrinsics", "tool", "heat", "turn")
     both = replace(long, real=real, **{n: torch.cat([getattr(long, n), getattr(short, n)]) for n in names})
     found = replay(remembering, both)
     for rows, expected in ((slice(5), replay(remembering, long)), (slice(5, 7), replay(remembering, short))):

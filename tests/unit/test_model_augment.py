@@ -12,7 +12,6 @@ from lerobot_histmv.model.augment import (
     jitter_colours,
     move_cameras,
     move_points,
-    multiply_quaternions,
     noisy_depth,
     random_world_motion,
 )
@@ -35,14 +34,6 @@ def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
 def motion(config: AugmentConfig = STRONG) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(3)
     return random_world_motion(N, config, SEEN)
-
-
-def test_hamilton_product_equals_scipy() -> None:
-    first, second = (torch.nn.functional.normalize(q, dim=-1) for q in torch.randn(2, 11, 4, dtype=torch.float64))
-    rotations = [Rotation.from_quat(q.numpy(), scalar_first=True) for q in (first, second)]
-    expected = (rotations[0] * rotations[1]).as_matrix()
-    found = Rotation.from_quat(multiply_quaternions(first, second).numpy(), scalar_first=True).as_matrix()
-    torch.testing.assert_close(torch.from_numpy(found), torch.from_numpy(expected))
 
 
 def test_motion_s_quaternion_is_its_matrix_s_and_turns_about_the_vertical() -> None:
@@ -96,9 +87,8 @@ def test_cameras_given_are_not_changed() -> None:
 def shifted_scene(most: int) -> tuple[Window, Window]:
     """A window before and after nothing but a pixel shift."""
     rgb, depth, intrinsics, extrinsics = scene()
-    window = Window(
-        torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, SEEN.expand(N, 1, 3), torch.ones(N, 1), None
-    )
+    tool, heat, turn = SEEN.expand(N, 1, 3), torch.ones(N, 1), torch.eye(4)[:1].expand(N, 4)
+    window = Window(torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, tool, heat, turn, action=None)
     torch.manual_seed(0)
     return window, window.distorted(replace(OFF, pixels=most))
 

@@ -16,6 +16,7 @@ from lerobot_histmv.model.decoder import (
     around_peak,
     spatial_log_softmax,
 )
+from lerobot_histmv.model.rotations import matrix_of
 
 M, Y, X, WIDTH = 3, 32, 48, 8
 SKIPS = [4, 5, 5, 5]
@@ -85,6 +86,7 @@ def inputs(seed: int = 1) -> dict[str, Any]:
         "cloud": cloud,
         "valid": torch.rand(M, Y, X, generator=generator) < 0.7,
         "eye": torch.randn(M, 3, generator=generator),
+        "tool": matrix_of(nn.functional.normalize(torch.randn(M, 4, generator=generator), dim=1)),
     }
 
 
@@ -173,10 +175,18 @@ def test_depth_number_moves_the_position_along_the_ray_from_the_camera() -> None
     given, module = inputs(), decoder()
     last = module.pose.dense[-1]
     nn.init.zeros_(last.weight)
-    last.bias.data = torch.tensor([0.0, 0, 0, 1, 0, 0, 0, 0, 0.2])
+    last.bias.data = torch.tensor([0.0] * 16 + [0.2])
     found = decode(module, given)
     ray = (found.surface - given["eye"]) / (found.surface - given["eye"]).norm(dim=1, keepdim=True)
     torch.testing.assert_close(found.position, found.surface + 0.2 * OFFSET_UNIT * ray)
+
+
+@pytest.mark.parametrize("tool_frame", [True, False])
+def test_rotation_turns_with_the_tool_only_in_the_tool_s_frame(tool_frame: bool) -> None:
+    given, module = inputs(), Decoder(WIDTH, SKIPS, DecoderConfig(tool_frame=tool_frame))
+    before = decode(module, given).quaternion
+    given["tool"] = given["tool"].mT
+    assert decode(module, given).quaternion.equal(before) != tool_frame
 
 
 def test_heat_map_learns_to_point_at_a_target_on_the_cloud() -> None:
@@ -227,7 +237,8 @@ def together(module: Decoder, steps: list[dict[str, Any]], weights: Tensor) -> t
     names = ("maps", "view", "cloud", "valid", "eye")
     maps, views, cloud, valid, eyes = (torch.stack([given[name] for given in steps]) for name in names)
     skips = [torch.cat(levels) for levels in zip(*(given["skips"] for given in steps), strict=True)]
-    return module.together(maps, views, skips, cloud, valid, eyes, weights)
+    tools = torch.stack([given["tool"][0] for given in steps])
+    return module.together(maps, views, skips, cloud, valid, eyes, tools, weights)
 
 
 @pytest.mark.parametrize("training", [True, False])

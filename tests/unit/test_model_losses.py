@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
@@ -39,7 +40,7 @@ def heat_case() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     rows, columns = torch.meshgrid(torch.arange(Y), torch.arange(X), indexing="ij")
     cloud = 0.01 * torch.stack([columns, rows, torch.zeros(Y, X)]).expand(M, 3, Y, X)
     uniform = torch.full((M, Y, X), -math.log(Y * X))
-    return uniform, cloud.contiguous(), cloud[:, :, 2, 3]
+    return uniform, cloud.contiguous(), torch.cat([cloud[:, :, 2, 3], unit(M, 2)], dim=1)
 
 
 def test_heat_loss_of_a_uniform_map_is_the_logarithm_of_its_pixels() -> None:
@@ -48,14 +49,37 @@ def test_heat_loss_of_a_uniform_map_is_the_logarithm_of_its_pixels() -> None:
 
 def test_heat_loss_of_a_key_pose_above_the_surface_wants_the_pixels_below_it() -> None:
     _, cloud, target = heat_case()
-    heights = torch.tensor([0.03, 0.07, 0.13])[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    heights = torch.tensor([0.03, 0.07, 0.13])[:, None] * torch.eye(7)[2]
     log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
     torch.testing.assert_close(heat_loss(log_heat, cloud, target + heights), heat_loss(log_heat, cloud, target))
 
 
+def test_distances_along_the_approach_axis_count_less() -> None:
+    """The loss is that of plain distances in a world that is squeezed along the key pose's z axis."""
+    log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
+    cloud, target = torch.rand(M, 3, Y, X, generator=torch.Generator().manual_seed(1)) / 10, heat_case()[2]
+    rotation = torch.from_numpy(Rotation.from_quat(target[:, 3:].numpy(), scalar_first=True).as_matrix()).float()
+    offset = torch.einsum("mij,miyx->mjyx", rotation, cloud - target[:, :3, None, None])
+    squeezed = offset * torch.tensor([1, 1, 0.3])[:, None, None]
+    plain = heat_loss(log_heat, squeezed, torch.zeros_like(target))
+    torch.testing.assert_close(heat_loss(log_heat, cloud, target, approach=0.3), plain, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(heat_loss(log_heat, cloud, target), plain, atol=1e-3)
+
+
+def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_a_gripper_beside_the_pose() -> None:
+    """Over pixel (2, 3) and pointing down; the last pixel, of a gripper, is 9 cm to the side, at the pose's height."""
+    uniform, cloud, target = heat_case()
+    target[:, 2], target[:, 3:] = 0.13, torch.eye(4)[0]
+    cloud[:, :, -1, -1] = target[:, :3] + torch.tensor([0.09, 0.0, 0.0])
+    steps = uniform.requires_grad_()
+    wanted = [-torch.autograd.grad(heat_loss(steps, cloud, target, factor).sum(), steps)[0] for factor in (0.5, 1.0)]
+    assert wanted[0][:, -1, -1].max() < 0.01, "of a whole of 1"
+    assert wanted[1][:, -1, -1].min() > 0.99
+
+
 def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
     _, cloud, target = heat_case()
-    centimetres = 100 * (cloud - target[:, :, None, None]).norm(dim=1)
+    centimetres = 100 * (cloud - target[:, :3, None, None]).norm(dim=1)
     maps = [(sign * centimetres).flatten(1).log_softmax(dim=1).unflatten(1, (Y, X)) for sign in (-1, 0, 1)]
     losses = [heat_loss(log_heat, cloud, target) for log_heat in maps]
     assert (losses[0] < losses[1]).all()
@@ -64,7 +88,7 @@ def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
 
 def test_heat_loss_is_zero_where_the_target_is_not_seen() -> None:
     uniform, cloud, target = heat_case()
-    torch.testing.assert_close(heat_loss(uniform, cloud, target + 5), torch.zeros(M))
+    torch.testing.assert_close(heat_loss(uniform, cloud, target + 5 * torch.eye(7)[2]), torch.zeros(M))
 
 
 def test_heat_loss_is_finite_with_invalid_pixels_and_for_a_view_without_any() -> None:
@@ -82,7 +106,8 @@ def test_heat_loss_is_finite_with_invalid_pixels_and_for_a_view_without_any() ->
 
 
 def prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor]:
-    log_heat, cloud, position = heat_case()
+    log_heat, cloud, target = heat_case()
+    position = target[:, :3]
     gripper = torch.tensor([2.0, -1.0, 0.5])
     reached = position + torch.tensor([0.0, 0.03, 0.04])
     predicted = Prediction(reached, position, unit(M, 2), gripper, log_heat, certainty=torch.ones(M))

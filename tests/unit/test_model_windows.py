@@ -11,15 +11,12 @@ from tiny_scene import SIZE, cameras_around, noise_images
 from lerobot_histmv import keys
 from lerobot_histmv.model.augment import AugmentConfig, random_world_motion
 from lerobot_histmv.model.cameras import project
-from lerobot_histmv.windows import Window, causal_heat, choose_rows, read_window, row_weights
+from lerobot_histmv.windows import Window, causal_heat, look_back, read_window
 
 B, T, CAMERAS = 3, 9, ["front", "wrist"]
 K, S = len(CAMERAS), 4
 EPISODES = ((0, 7), (2, 7), (4, 5))
 """Which of the nine rows around each drawn row, the fifth, lie in its episode."""
-WINDOWS = ((0, 5), (2, 6), (4, 5))
-"""Rows of each window: up to the drawn one, the first four of the episode, and an episode of one row."""
-
 
 STILL = AugmentConfig(yaw=0.0, shift=0.0, pixels=0, brightness=0.0, contrast=0.0, lost_view=0.0, card=0.0)
 
@@ -46,32 +43,54 @@ def window_batch() -> dict[str, Any]:
 def test_only_real_rows_are_kept_in_order() -> None:
     batch = window_batch()
     window = read_window(batch, CAMERAS)
-    assert window.real.tolist() == [[i < last - first for i in range(S + 1)] for first, last in WINDOWS]
-    rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
+    assert window.real.tolist() == [[first <= t < last for t in range(T)] for first, last in EPISODES]
+    rows = [(b, t) for b in range(B) for t in range(*EPISODES[b])]
     assert len(window.tool) == len(rows) == window.real.sum()
     for n, (b, t) in enumerate(rows):
         assert window.tool[n, -1].equal(batch[keys.STATE][b, t, :3])
         assert window.heat[n, -1] == 1
+        torch.testing.assert_close(window.turn[n], batch[keys.STATE][b, t, 3:7])
         assert window.action[n].equal(batch[keys.ACTION][b, t])
         for k, camera in enumerate(CAMERAS):
             assert window.rgb[n, k].equal(batch[keys.rgb_key(camera)][b, t])
             torch.testing.assert_close(window.depth[n, k], batch[keys.depth_key(camera)][b, t, 0] / 1000)
 
 
+def neighbourhoods(past_steps: int, length: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows around each row of an episode, and which of them it has."""
+    rows = torch.arange(length)[:, None] + torch.arange(-past_steps, past_steps + 1)
+    return rows, (rows >= 0) & (rows < length)
+
+
+LENGTHS = [1, 2, 3, 7, 13]
+
+
 @pytest.mark.parametrize("past_steps", [0, 1, 2, 5])
-@pytest.mark.parametrize("length", [1, 2, 3, 7])
+@pytest.mark.parametrize("length", LENGTHS)
 def test_every_row_of_an_episode_counts_once(past_steps: int, length: int) -> None:
-    """Each row is drawn once per epoch; the windows' losses weigh alike, so the shares of a row must add up to 1."""
-    drawn, around = torch.arange(length), torch.arange(-past_steps, past_steps + 1)
-    rows = drawn[:, None] + around
-    real, picked = choose_rows((rows >= 0) & (rows < length))
-    weights = row_weights(real, past_steps)
-    torch.testing.assert_close(torch.zeros(length).index_add(0, rows[picked], weights), torch.ones(length))
-    owner = real.nonzero()[:, 0]
-    torch.testing.assert_close(torch.zeros(length).index_add(0, owner, weights), torch.ones(length))
-    starts = torch.tensor([rows[n][picked[n]].min() for n in range(length)])
-    whole = (starts == 0)[owner] | (rows[picked] == drawn[owner])
-    assert (weights[~whole] == 0).all(), "a row without its whole history teaches nothing"
+    """Each row is drawn once per epoch; a draw's loss is a plain sum, so the shares of a row must add up to 1."""
+    rows, exist = neighbourhoods(past_steps, length)
+    lookback, shares = look_back(exist)
+    decided = rows[exist][lookback.decided]
+    torch.testing.assert_close(torch.zeros(length).index_add(0, decided, shares), torch.ones(length))
+
+
+@pytest.mark.parametrize("past_steps", [0, 1, 2, 5])
+@pytest.mark.parametrize("length", LENGTHS)
+def test_every_decision_sees_its_whole_history_as_acting_does(past_steps: int, length: int) -> None:
+    """The last s steps and itself, in order, from one episode; and every row that a draw can teach is taught by it."""
+    rows, exist = neighbourhoods(past_steps, length)
+    lookback, _ = look_back(exist)
+    owner, absolute = exist.nonzero()[:, 0], rows[exist]
+    taught = []
+    for window, step in lookback.asked.nonzero():
+        seen = lookback.rows[window, : step + 1][lookback.real[window, : step + 1]]
+        (draw,) = owner[seen].unique().tolist()
+        last = int(absolute[seen[-1]])
+        assert absolute[seen].tolist() == list(range(max(0, last - past_steps), last + 1))
+        taught.append((draw, last))
+    whole = [(n, r) for n, r in zip(owner.tolist(), absolute.tolist(), strict=True) if r >= n or n < past_steps]
+    assert sorted(taught) == sorted(whole), "all rows of a draw that shows the episode's start, else those from it on"
 
 
 def test_padding_rows_have_no_influence_on_the_window() -> None:
@@ -137,7 +156,7 @@ def test_each_row_sees_the_tool_now_and_in_the_last_s_steps_that_are_known_and_n
     before[:, : more // 2] = True  # the first row's episode starts before the images, but not with the states
     batch[padded] = absent = torch.cat([before, batch[padded]], dim=1)
     seen = read_window(batch, CAMERAS).observe(torch.zeros(B, 2))
-    rows = [(b, t) for b in range(B) for t in range(*WINDOWS[b])]
+    rows = [(b, t) for b in range(B) for t in range(*EPISODES[b])]
     for n, (b, t) in enumerate(rows):
         drawn = {tuple(seen.tool[n, p].tolist()): seen.heat[n, p].item() for p in range(S + 1) if seen.heat[n, p] > 0}
         last = [i for i in range(max(0, t + more - S), t + more + 1) if not absent[b, i]]
@@ -154,7 +173,7 @@ def test_each_row_sees_the_tool_now_and_in_the_last_s_steps_that_are_known_and_n
 def test_each_row_gets_the_instruction_of_its_window() -> None:
     text = torch.arange(B, dtype=torch.float32)[:, None]
     seen = read_window(window_batch(), CAMERAS).observe(text)
-    assert seen.text[:, 0].tolist() == [0] * 5 + [1] * 4 + [2]
+    assert seen.text[:, 0].tolist() == [0] * 7 + [1] * 5 + [2]
 
 
 def moved_window() -> tuple[Window, Window, torch.Tensor]:
@@ -177,13 +196,12 @@ def test_world_motion_keeps_the_projections_of_tool_and_target() -> None:
         torch.testing.assert_close(found[ahead], expected[ahead], atol=5e-2, rtol=1e-4)
 
 
-def test_world_motion_turns_the_target_with_the_world_and_keeps_the_gripper() -> None:
+def test_world_motion_turns_tool_and_target_with_the_world_and_keeps_the_gripper() -> None:
     window, moved, motion = moved_window()
-    before, after = (
-        Rotation.from_quat(w.action[:, 3:7].numpy(), scalar_first=True).as_matrix() for w in (window, moved)
-    )
-    torch.testing.assert_close(torch.from_numpy(after).float(), motion[:, :, :3] @ torch.from_numpy(before).float())
-    torch.testing.assert_close(moved.action[:, 3:7].norm(dim=1), torch.ones(len(moved.action)))
+    for quaternions in ((window.action[:, 3:7], moved.action[:, 3:7]), (window.turn, moved.turn)):
+        before, after = (Rotation.from_quat(q.numpy(), scalar_first=True).as_matrix() for q in quaternions)
+        torch.testing.assert_close(torch.from_numpy(after).float(), motion[:, :, :3] @ torch.from_numpy(before).float())
+        torch.testing.assert_close(quaternions[1].norm(dim=1), torch.ones(len(moved.turn)))
     assert moved.action[:, 7].equal(window.action[:, 7])
     assert moved.rgb is window.rgb
 
