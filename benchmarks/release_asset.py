@@ -24,17 +24,17 @@ from success import (
     SCENES,
     SETTINGS,
     add_result,
-    anywhere,
     command_environment,
     data_stages,
     evaluation_stage,
+    told,
     training_stage,
 )
 
 from dataset_tools.demo import last_checkpoint
 from dataset_tools.hub import push
 from dataset_tools.shards import write_json
-from dataset_tools.stages import Stage, read_state, run_stages, say
+from dataset_tools.stages import Stage, run_stages, say
 
 RESULTS = Path(__file__).parent / "results" / "release_asset.json"
 OUTPUT = Path("outputs/release")
@@ -139,20 +139,6 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
-def told(args: argparse.Namespace, folder: Path, archive: Path) -> dict[str, Any]:
-    """What the archive is, what its policy reached, and the commands that made it."""
-    state = read_state(folder)
-    (task,) = json.loads((folder / "evaluation" / "eval_info.json").read_text())["per_task"]
-    return {
-        "bytes": archive.stat().st_size,
-        "sha256": sha256(archive),
-        "demonstrations": SETTINGS[args.setting][1],
-        "training_minutes": round(state["train"].seconds / 60, 1),
-        **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95")},
-        "commands": [anywhere(" ".join(record.command), args.output, OUTPUT) for record in state.values()],
-    }
-
-
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -174,7 +160,9 @@ def main() -> None:
     run_stages(stages(args, folder), folder, console, command_environment(args.threads))
     archive = pack(last_checkpoint(folder / "train"), folder / "evaluation", f"histmv_{args.setting}", args.output)
     if not (args.episodes or args.steps) and args.scenes == SCENES:
-        add_result(f"{args.setting}, {args.preset}, seed {args.seed}", told(args, folder, archive), RESULTS)
+        result = {"bytes": archive.stat().st_size, "sha256": sha256(archive)}
+        result |= told(args.setting, args.threads, folder, args.output, OUTPUT)
+        add_result(f"{args.setting}, {args.preset}, seed {args.seed}", result, RESULTS)
     say(console, f"{archive}: {archive.stat().st_size / 1e6:.1f} MB\nSHA-256 {sha256(archive)}")
 
 

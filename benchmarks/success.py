@@ -90,23 +90,25 @@ def add_result(name: str, result: dict[str, Any], file: Path = RESULTS) -> None:
         write_json(file, dict(sorted((known | {name: result}).items())))
 
 
+def told(setting: str, threads: int, own: Path, output: Path, default: Path = OUTPUT) -> dict[str, Any]:
+    """What the run in ``own`` learned from, what its evaluation found, and the commands that made it."""
+    state = read_state(own)
+    (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
+    return {
+        "demonstrations": SETTINGS[setting][1],
+        "threads": threads,
+        "training_minutes": round(state["train"].seconds / 60, 1),
+        **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95", "failures", "decision_ms")},
+        "commands": [anywhere(" ".join(record.command), output, default) for record in state.values()],
+    }
+
+
 def learn(setting: str, seed: int, folder: Path, threads: int, environment: dict[str, str]) -> None:
     """Train and evaluate one seed and write down what came out."""
     own = folder / f"seed_{seed}"
     evaluate = evaluation_stage(setting, last_checkpoint(own / "train"), own / "evaluation")
     run_stages([training_stage(setting, seed, folder, own, "train/default"), evaluate], own, Console(), environment)
-    state = read_state(own)
-    (task,) = json.loads((own / "evaluation" / "eval_info.json").read_text())["per_task"]
-    add_result(
-        f"{setting}, seed {seed}",
-        {
-            "demonstrations": SETTINGS[setting][1],
-            "threads": threads,
-            "training_minutes": round(state["train"].seconds / 60, 1),
-            **{key: task[key] for key in ("n_successes", "n_episodes", "wilson_95", "failures", "decision_ms")},
-            "commands": [anywhere(" ".join(record.command), folder.parent) for record in state.values()],
-        },
-    )
+    add_result(f"{setting}, seed {seed}", told(setting, threads, own, folder.parent))
 
 
 def command_environment(threads: int) -> dict[str, str]:

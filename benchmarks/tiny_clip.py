@@ -135,7 +135,7 @@ class Training:
         weights = [*self.towers.parameters(), self.scale]
         self.optimizer = torch.optim.AdamW(weights, RATE, weight_decay=WEIGHT_DECAY)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimizer, RATE, total_steps=steps, pct_start=WARM_UP)
-        self.file = folder / f"training_{steps}_steps_of_{batch}.pt"
+        self.file = folder / f"training_{steps}_steps_of_{batch}_from_{len(scenes)}_scenes.pt"
         if self.file.exists():
             self.restore()
 

@@ -27,8 +27,8 @@ from lerobot_histmv.model.semantics import ClipTowers
 from lerobot_histmv.modeling_histmv import MEANINGS
 
 RESULTS = Path(__file__).parent / "results" / "training_cost.json"
-ROWS = 6
-"""Rows that a full window encodes; the loader reads 11 around each drawn row."""
+ROWS = 11
+"""Rows of a window amid a long episode, all of which are encoded: it teaches the last six."""
 BATCHES = {"tiny": (6, 64), "ViT-B-32": (6, 32)}
 """Windows per GPU of the estimates: the default preset's, and what fills a GPU better."""
 
@@ -94,13 +94,12 @@ def cost(step: Callable[[], Tensor], parameters: list[Tensor]) -> Cost:
 
 
 def windows(count: int) -> dict[str, Any]:
-    """A batch of windows of ``ROWS`` real rows: 2s + 1 rows around each drawn row, all inside of the episode."""
-    around = 2 * ROWS - 1
-    rows = [row for _, row in zip(range(around), [*observations(), *observations()], strict=False)]
+    """A batch of windows whose ``ROWS`` rows, 2s + 1 around each drawn row, all are inside of the episode."""
+    rows = [row for _, row in zip(range(ROWS), [*observations(), *observations()], strict=False)]
     batch = {key: torch.cat([row[key] for row in rows])[None].expand(count, *[-1] * rows[0][key].ndim).clone()
              for key in rows[0] if key != "task"}  # fmt: skip
     batch[keys.ACTION] = batch[keys.STATE][..., :8].clone()
-    pads = {f"{key}_is_pad": torch.zeros(count, around, dtype=torch.bool) for key in batch}
+    pads = {f"{key}_is_pad": torch.zeros(count, ROWS, dtype=torch.bool) for key in batch}
     return batch | pads | {"task": rows[0]["task"] * count}
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/training_profile.py [--threads=2] [--windows=6] [--steps=7] [--table]
 
-Runs the default network's training step on full windows (6 rows, three views, 128 x 128 pixels), times every operation
+Runs the default network's training step on full windows (11 rows, three views, 128 x 128 pixels), times every operation
 that has FLOPs (convolutions, matrix products, attention; forward and backward) inside of the step, then repeats each
 alone with the same shapes and memory layouts. ``--table`` also prints the operations that take longest. Writes
 ``benchmarks/results/training_profile.json``, one entry per number of windows.

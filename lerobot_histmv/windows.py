@@ -27,7 +27,7 @@ def causal_heat(age: Tensor) -> Tensor:
 
 @dataclass
 class Window:
-    """The n real rows of b neighbourhoods of t rows, packed in row-major order.
+    """The n real rows of b windows of t rows, packed in row-major order.
 
     Args:
         real: which rows are real; the others lie before an episode's start.
@@ -99,17 +99,14 @@ class Window:
 
 
 def look_back(exist: Bool[Tensor, "b t"]) -> tuple[Lookback, Float[Tensor, " r"]]:
-    """Windows of up to s + 1 steps for every row whose whole history is among the 2s + 1 rows around each drawn one.
+    """Spans of up to s + 1 steps for every row whose whole history is in its window, and its share in the loss.
 
-    The first s + 1 rows of an episode share a window: causal attention shows each its own past. A later row has its
-    own, of itself and the s rows before it.
+    The first s + 1 rows of an episode are one span: causal attention shows each its own past. A later row has its own,
+    of itself and the s rows before it. Over an epoch, which draws every row once, the shares of a row sum to 1, however
+    many windows show it.
 
     Args:
-        exist: which of the rows from s before to s after the drawn one lie in its episode.
-
-    Returns:
-        The windows, and each asked row's share in the loss: over an epoch, which draws every row once, every row gets
-        a weight of 1, however many draws show it.
+        exist: which of the rows of each window, from s before to s after the drawn one, lie in its episode.
     """
     past_steps = exist.shape[1] // 2
     span, column = torch.arange(past_steps + 1, device=exist.device), torch.arange(exist.shape[1], device=exist.device)
@@ -121,10 +118,10 @@ def look_back(exist: Bool[Tensor, "b t"]) -> tuple[Lookback, Float[Tensor, " r"]
     real = exist[owner[:, None], columns]
     shared = (torch.arange(len(owner), device=exist.device) < starts.sum())[:, None]
     asked = real & (shared | (span == past_steps))
-    # Each of the first s rows is shown by all draws among these; any later one by the draws of itself and the s before.
+    # Of the first s rows each is asked for by the windows of all; any other one by its own and those of the s before.
     early = exist[owner].sum(dim=1)[:, None].clamp_max(past_steps)
     draws = torch.where(shared & (span < past_steps), early, past_steps + 1)
-    shown = real.any(dim=0)  # a column that no window has would only cost attention
+    shown = real.any(dim=0)  # a column that no span has would only cost attention
     rows, real, asked, draws = (each[:, shown] for each in (pack(exist)[owner[:, None], columns], real, asked, draws))
     return Lookback(rows, real, asked), 1 / draws[asked]
 

@@ -144,6 +144,12 @@ class ViewConfig:
             )
         require("views.mi_loss", self.mi_loss, ("nmi", "text", "literal"))
         require("views.train_choice", self.train_choice, ("argmax", "sampled", "expected", "ranked"))
+        for name, default in (("mi_loss", "nmi"), ("mi_gradient", False)):
+            if self.fusion != "attention" and getattr(self, name) != default:
+                raise ValueError(
+                    f"views.{name}={getattr(self, name)!r} is about the view weights and has no effect with "
+                    f"views.fusion={self.fusion!r}; use views.fusion='attention', or leave it out"
+                )
         for name, default in (("act", "certainty"), ("train_choice", "ranked")):
             if self.decode == "all" and getattr(self, name) != default:
                 raise ValueError(

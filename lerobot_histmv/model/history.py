@@ -14,12 +14,12 @@ from lerobot_histmv.model.layers import Modulation
 
 @dataclass(frozen=True)
 class Lookback:
-    """Which of n steps the m windows of attention hold, and whose decisions they give.
+    """Which of n steps each of m spans of attention holds, and of which of them a decision is wanted.
 
     Args:
-        rows: the steps of a window, old to new; any number where there is none.
+        rows: the steps of a span, old to new; any number where there is none.
         real: where there is one.
-        asked: steps whose history-enriched map is wanted from this window.
+        asked: steps whose history-enriched map is wanted from this span.
     """
 
     rows: Int[Tensor, "m t"]
@@ -33,11 +33,11 @@ class Lookback:
 
     @classmethod
     def over(cls, real: Bool[Tensor, "m t"]) -> "Lookback":
-        """Windows whose real steps lie packed in row-major order; all are asked for."""
+        """Spans whose real steps lie packed in row-major order; all are asked for."""
         return cls(pack(real), real, real)
 
     def newest(self) -> "Lookback":
-        """The same windows, each asked for its last step only."""
+        """The same spans, each asked for its last step only."""
         return replace(self, asked=self.real & (step_index(self.real) == self.real.sum(dim=1, keepdim=True) - 1))
 
 

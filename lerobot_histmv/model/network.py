@@ -173,7 +173,7 @@ class HistMVNet(nn.Module):
         self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], lookback: Lookback
     ) -> Float[Tensor, "r d kh w"]:
         """History-enriched maps of the r steps asked for, from all n."""
-        if not self.config.history.memory:  # every step is a window of its own
+        if not self.config.history.memory:  # every step is a span of its own
             decided = lookback.decided
             lookback = Lookback.over(torch.ones_like(decided, dtype=torch.bool)[:, None])
             fused, text = fused[decided], text[decided]

@@ -10,11 +10,10 @@ import draccus
 import pytest
 from fake_demonstrations import CAMERAS, FAILING_SEEDS, SIZE, recorder
 from fake_ur5 import write_checkpoint
+from helpers.cards import commands_in, pushed
 from helpers.episodes import snapshot, write_picks
-from helpers.evaluations import TASKS, evaluated
 from helpers.keyframed import SIZE as SQUARE
 from huggingface_hub import DatasetCard, ModelCard
-from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -22,9 +21,6 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from tiny_policy import TASK, tiny_config, tiny_policy
 
 from dataset_tools import cli
-from dataset_tools.eval_results import INFO_FILE
-from dataset_tools.eval_settings import EvaluateConfig
-from dataset_tools.evaluate import Evaluation
 from dataset_tools.hub import card
 from dataset_tools.hub.card_commands import record_command
 from dataset_tools.record import RecordConfig, checked_settings
@@ -33,8 +29,6 @@ from dataset_tools.record_settings import RecordSettings
 from dataset_tools.replay import SOURCE_RECORDING_FILE
 from dataset_tools.shards import Outcome
 from lerobot_histmv import keys
-from lerobot_histmv.envs.disturbances import Disturbances
-from lerobot_histmv.evaluation_text import in_words, unusual_options
 
 KEYFRAMING = [
     "--method=exact",
@@ -143,16 +137,6 @@ def trained(repo: str, root: Path | None = None, **changes: Any) -> TrainPipelin
     return TrainPipelineConfig(dataset, policy=policy, steps=7, batch_size=3, seed=5, **changes)
 
 
-def commands_in(text: str, section: str) -> dict[str, list[str]]:
-    """Options of the commands in a section of a card, by program."""
-    block = text.partition(f"## {section}\n")[2].split("```")[1].removeprefix("bash").replace("\\\n", " ")
-    found = {}
-    for words in map(shlex.split, block.strip().splitlines()):
-        options = [word for word in words if word.startswith("--")]
-        found[" ".join(words[: len(words) - len(options)])] = options
-    return found
-
-
 def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) -> None:
     policy = tiny_policy(tiny_config(repo_id="ann/policy"))
     meta = LeRobotDatasetMetadata("ann/keys", keyed)
@@ -192,12 +176,6 @@ def recorded(root: Path, repo: str) -> RecordSettings:
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
     return write_checkpoint(tmp_path / "policy", size=(SQUARE, SQUARE))
-
-
-def pushed(checkpoint: Path, *options: str) -> ModelCard:
-    """The card that ``histmv push --upload=false`` writes."""
-    cli.main(["push", "--repo_id=ann/policy", f"--root={checkpoint}", "--upload=false", *options])
-    return ModelCard.load(checkpoint / card.CARD_FILE)
 
 
 def test_handed_on_checkpoints_card_makes_data_and_training_again(
@@ -240,67 +218,6 @@ def test_data_that_do_not_tell_how_they_were_made_are_left_to_the_reader(checkpo
     assert {"--config_path=policy", "--dataset.root=DATA"} <= set(commands["lerobot-train"])
     assert "DATA is the folder of `ann/real`" in found.text
     assert str(tmp_path) not in found.text
-
-
-def test_policys_card_tells_measured_success_of_this_very_checkpoint(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = snapshot(checkpoint)
-    other = write_checkpoint(tmp_path / "other", seed=1, size=(SQUARE, SQUARE))
-    with pytest.raises(SystemExit):
-        pushed(checkpoint, f"--evaluation={evaluated(tmp_path / 'wrong', other)}")
-    assert "whose weights are not those given" in capsys.readouterr().err
-    assert snapshot(checkpoint) == files
-    found = pushed(checkpoint, f"--evaluation={evaluated(tmp_path / 'evaluation', checkpoint)}")
-    assert "| `turn_tap.left` | 2 of 3 | 20.8 to 93.9 % | time 1 | usual |" in found.text
-    assert "Scenes 200019 to 200021 of the environment `ur5`" in found.text
-    assert [(one.task_name, one.dataset_name, one.metric_value) for one in found.data.eval_results] == [
-        ("reach_target.red", "3 unseen scenes of reach_target.red", 66.7),
-        ("turn_tap.left", "3 unseen scenes of turn_tap.left", 66.7),
-    ]
-
-
-UNUSUAL: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "held-out sentences": ({"instruction_split": "held_out"}, []),
-    "control=servo; policy.control.rate=20": ({"control": "servo"}, ["--control.rate=20"]),
-    "held-out sentences; disturbances: dead_camera=1, distractors=2, camera=wrist": (
-        {
-            "instruction_split": "held_out",
-            "disturbances": Disturbances(dead_camera=1.0, distractors=2, camera="wrist"),
-        },
-        [],
-    ),
-}
-
-
-@pytest.mark.parametrize("words", UNUSUAL)
-def test_success_is_told_with_the_settings_it_was_measured_under(
-    words: str, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    env, overrides = UNUSUAL[words]
-    results = evaluated(tmp_path / "evaluation", checkpoint, overrides, **env)
-    found = pushed(checkpoint, f"--evaluation={results}")
-    assert found.text.count(f" | {words} |") == 2, "in every row"
-    assert {one.dataset_config for one in found.data.eval_results} == {words}
-    assert all(one.dataset_name.endswith(f"({words})") for one in found.data.eval_results)
-
-    monkeypatch.chdir(tmp_path)
-    commands = commands_in(found.text, "Evaluation")
-    assert commands["histmv eval"] == commands["lerobot-eval"]
-    again = Evaluation(EvaluateConfig.parse(commands["histmv eval"], "histmv eval"))
-    first = json.loads((results / INFO_FILE).read_text())
-    assert json.loads(json.dumps(again.settings["env"])) == first["settings"]["env"]
-    assert json.loads(json.dumps(again.settings["policy"])) == first["settings"]["policy"]
-    assert again.provenance()["seeds"] == first["seeds"]
-    assert again.config.env.task == ",".join(TASKS)
-
-
-def test_options_of_unknown_environments_are_all_told_and_paths_only_by_their_names(checkpoint: Path) -> None:
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    evaluation = {"env_type": "elsewhere", "settings": {"env": {"speed": 2.5, "scene": {"file": "/data/one/two.xml"}}}}
-    found = unusual_options(evaluation, config)
-    assert found == {"env.speed": 2.5, "env.scene.file": "two.xml"}
-    assert in_words(found) == "speed=2.5; scene.file=two.xml"
 
 
 @pytest.mark.parametrize("option", ["--upload=false", "--evaluation=results"])
