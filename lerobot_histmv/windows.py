@@ -38,6 +38,7 @@ class Window:
         tool: measured tool positions [m], the current one last.
         heat: their intensity, 1 now, less with age, 0 where there was none.
         turn: measured rotation of the tool, as a quaternion.
+        opening: measured opening of the gripper, 1 open.
         action: target position [m], quaternion wxyz, gripper; absent at inference.
         clip: stored semantic vectors of the views, of the images as recorded; absent if the data hold none that fit.
     """
@@ -50,6 +51,7 @@ class Window:
     tool: Float[Tensor, "n p 3"]
     heat: Float[Tensor, "n p"]
     turn: Float[Tensor, "n 4"]
+    opening: Float[Tensor, " n"]
     action: Float[Tensor, "n 8"] | None
     clip: Float[Tensor, "n k g"] | None = None
 
@@ -64,7 +66,16 @@ class Window:
         """What the network sees, each window with its instruction."""
         seen = text[self.real.nonzero()[:, 0]]
         return Observation(
-            self.rgb, self.depth, self.intrinsics, self.extrinsics, self.tool, self.heat, self.turn, seen, self.clip
+            rgb=self.rgb,
+            depth=self.depth,
+            intrinsics=self.intrinsics,
+            extrinsics=self.extrinsics,
+            tool=self.tool,
+            heat=self.heat,
+            turn=self.turn,
+            opening=self.opening,
+            text=seen,
+            clip=self.clip,
         )
 
     def moved(self, motion: Float[Tensor, "b 3 4"], turn: Float[Tensor, "b 4"]) -> "Window":
@@ -185,6 +196,7 @@ def read_window(batch: dict[str, Any], cameras: list[str], stored_as: str | None
         tool=tools,
         heat=heat,
         turn=functional.normalize(state[:, 3:7], dim=-1),
+        opening=state[:, 7],
         action=pick(keys.ACTION) if batch.get(keys.ACTION) is not None else None,
         clip=torch.stack([pick(key) for key in vectors], dim=1) if stored else None,
     )

@@ -76,5 +76,6 @@ def tiny_observation(n: int, k: int, text_width: int, seed: int = 0) -> Observat
         tool=tool,
         heat=torch.ones(n, 1),
         turn=torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=-1),
+        opening=torch.rand(n, generator=generator),
         text=text,
     )

@@ -245,10 +245,13 @@ class NetworkConfig:
     Args:
         width: d, channels of fused feature maps and tokens.
         workspace: lower and upper corner [m] of the box that holds every target; points outside are ignored.
+        proprioception: the measured opening of the gripper is added to every patch of a step: images show too little of
+            whether the gripper holds something, has let it go, or is about to close.
     """
 
     width: int = 64
     workspace: tuple[float, ...] = (-0.05, -0.65, -0.05, 0.95, 0.65, 0.8)
+    proprioception: bool = True
     texture: TextureConfig = field(default_factory=TextureConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     points: PointsConfig = field(default_factory=PointsConfig)

@@ -40,6 +40,7 @@ class Observation:
         tool: current and past tool positions in the base frame [m].
         heat: intensity of each tool position, 1 now, less with age, 0 where absent.
         turn: current rotation of the tool, as a unit quaternion w, x, y, z.
+        opening: current opening of the gripper, 1 open.
         text: instruction vectors.
         clip: semantic vector of each view, if it is stored with the data; else the image tower gives it.
     """
@@ -51,6 +52,7 @@ class Observation:
     tool: Float[Tensor, "n p 3"]
     heat: Float[Tensor, "n p"]
     turn: Float[Tensor, "n 4"]
+    opening: Float[Tensor, " n"]
     text: Float[Tensor, "n c"]
     clip: Float[Tensor, "n k g"] | None = None
 
@@ -125,6 +127,8 @@ class HistMVNet(nn.Module):
         self.view_attention: ViewAttention | EvenViews = EvenViews()
         if config.views.fusion == "attention":
             self.view_attention = ViewAttention(config.views, config.width, text_width)
+        if config.proprioception:
+            self.opening = nn.Sequential(nn.Linear(1, config.width), nn.GELU(), nn.Linear(config.width, config.width))
         self.fuse = stack_views if config.views.fusion == "tokens" else fuse_views
         self.history = History(config.history, config.width, text_width, grid)
         self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder)
@@ -167,6 +171,8 @@ class HistMVNet(nn.Module):
             maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
         fused = self.fuse(maps, weights)
+        if self.config.proprioception:
+            fused = fused + rearrange(self.opening(seen.opening[:, None]), "n d -> n d 1 1")
         return Encoding(fused, maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3], tool)
 
     def remember(

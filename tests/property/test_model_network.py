@@ -158,6 +158,7 @@ def window(steps: int, seed: int = 0, k: int = 2) -> Window:
         extrinsics=extrinsics.expand(steps, k, 3, 4),
         **walked(SEEN + 0.2 * torch.randn(steps, 3, generator=generator)),
         turn=torch.nn.functional.normalize(torch.randn(steps, 4, generator=generator), dim=-1),
+        opening=torch.rand(steps, generator=generator),
         action=None,
     )
 
@@ -205,12 +206,22 @@ def test_history_matters_from_the_third_step_on() -> None:
     assert not torch.allclose(found.position[2], expected.position[2], atol=1e-6)
 
 
+@pytest.mark.parametrize("proprioception", [True, False])
+def test_the_gripper_s_opening_now_and_before_matters_only_with_proprioception(proprioception: bool) -> None:
+    net = tiny_net(history=HistoryConfig(past_steps=4, layers=2, heads=2), proprioception=proprioception)
+    rows = window(4)
+    for step in (1, 3):
+        other = replace(rows, opening=rows.opening.index_fill(0, torch.tensor(step), 0.5))
+        first, second = (replay(net, each).position[3] for each in (rows, other))
+        assert first.equal(second) != proprioception
+
+
 def test_windows_of_different_length_do_not_mix(remembering: HistMVNet) -> None:
     long, short = window(5), window(2, seed=3)
     real = torch.cat([long.real, torch.tensor([[False] * 3 + [True] * 2])])
     room = long.tool.shape[1] - short.tool.shape[1]
     short = replace(short, tool=pad(short.tool, (0, 0, room, 0)), heat=pad(short.heat, (room, 0)))
-    names = ("rgb", "depth", "intrinsics", "extrinsics", "tool", "heat", "turn")
+    names = ("rgb", "depth", "intrinsics", "extrinsics", "tool", "heat", "turn", "opening")
     both = replace(long, real=real, **{n: torch.cat([getattr(long, n), getattr(short, n)]) for n in names})
     found = replay(remembering, both)
     for rows, expected in ((slice(5), replay(remembering, long)), (slice(5, 7), replay(remembering, short))):

@@ -88,7 +88,9 @@ def shifted_scene(most: int) -> tuple[Window, Window]:
     """A window before and after nothing but a pixel shift."""
     rgb, depth, intrinsics, extrinsics = scene()
     tool, heat, turn = SEEN.expand(N, 1, 3), torch.ones(N, 1), torch.eye(4)[:1].expand(N, 4)
-    window = Window(torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, tool, heat, turn, action=None)
+    window = Window(
+        torch.ones(N, 1).bool(), rgb, depth, intrinsics, extrinsics, tool, heat, turn, torch.ones(N), action=None
+    )
     torch.manual_seed(0)
     return window, window.distorted(replace(OFF, pixels=most))
 

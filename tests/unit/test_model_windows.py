@@ -50,6 +50,7 @@ def test_only_real_rows_are_kept_in_order() -> None:
         assert window.tool[n, -1].equal(batch[keys.STATE][b, t, :3])
         assert window.heat[n, -1] == 1
         torch.testing.assert_close(window.turn[n], batch[keys.STATE][b, t, 3:7])
+        assert window.opening[n] == batch[keys.STATE][b, t, 7]
         assert window.action[n].equal(batch[keys.ACTION][b, t])
         for k, camera in enumerate(CAMERAS):
             assert window.rgb[n, k].equal(batch[keys.rgb_key(camera)][b, t])
