@@ -31,6 +31,8 @@ from lerobot_histmv.geometry import UNIT_TOLERANCE
 
 METRE_LIMIT = 20.0
 """Depth whose largest value lies below this [mm] was surely meant in metres."""
+OPENING_TOLERANCE = 0.05
+"""How far beyond closed (0) or open (1) a gripper may be measured."""
 
 
 @dataclass
@@ -52,8 +54,8 @@ class CheckInputStep(ProcessorStep):
         """Check one transition.
 
         Raises:
-            ValueError: a camera is missing, numbers are not finite, no view has valid depth, depth is in metres, or a
-                quaternion is not unit.
+            ValueError: a camera is missing, numbers are not finite, no view has valid depth, depth is in metres, a
+                quaternion is not unit, or a gripper is not between 0 and 1.
         """
         new = transition.copy()
         observation = separate_calibration(dict(new[TransitionKey.OBSERVATION] or {}), len(self.cameras))
@@ -76,11 +78,13 @@ class CheckInputStep(ProcessorStep):
                 observation[key] = observation[key][None]
             check_finite(key, observation[key])
         check_unit(keys.STATE, observation[keys.STATE])
+        check_gripper(keys.STATE, observation[keys.STATE])
         check_calibration(observation[keys.INTRINSICS], observation[keys.EXTRINSICS], self.cameras)
         action = new.get(TransitionKey.ACTION)
         if isinstance(action, Tensor):
             check_finite(keys.ACTION, action)
             check_unit(keys.ACTION, action)
+            check_gripper(keys.ACTION, action)
         new[TransitionKey.OBSERVATION] = observation
         return new
 
@@ -177,6 +181,17 @@ def check_unit(key: str, vectors: Tensor) -> None:
         raise ValueError(
             f"{key} holds a quaternion of norm {float(norms[away.argmax()]):.3g}; it must be unit, "
             "in the order w, x, y, z"
+        )
+
+
+def check_gripper(key: str, vectors: Tensor) -> None:
+    """Raise ValueError if gripper openings or commands (component 7) are not those of ``keys.GRIPPER_NAME``."""
+    grippers = vectors[..., 7]
+    away = (grippers - 0.5).abs()
+    if (away > 0.5 + OPENING_TOLERANCE).any():
+        raise ValueError(
+            f"{key} holds a {keys.GRIPPER_NAME} of {float(grippers.flatten()[away.argmax()]):.3g}; it must be from 0 "
+            "(closed) to 1 (open): divide by the opening's range"
         )
 
 

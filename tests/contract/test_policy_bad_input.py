@@ -172,6 +172,7 @@ SPOILT_OBSERVATIONS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         put(keys.STATE, 2.0, slice(3, 7)),
         r"observation\.state.*quaternion of norm 4.*w, x, y, z",
     ),
+    "gripper in percent": (put(keys.STATE, 87.0, 7), r"observation\.state.*gripper\.pos of 87.*0 \(closed\) to 1"),
     "zero quaternion": (put(keys.STATE, 0.0, slice(3, 7)), r"observation\.state.*quaternion of norm 0"),
     "colours of 0 to 255": (scale(FRONT, 255.0), r"observation\.images\.front.*\[0, 1\]"),
     "focal length of 0": (put(keys.INTRINSICS, 0.0, 0), r"camera_intrinsics.*focal"),
@@ -201,8 +202,9 @@ def test_observations_that_would_be_misread_are_refused(case: str, where: str) -
     [
         (put(keys.ACTION, torch.nan, 1), r"action holds NaN"),
         (put(keys.ACTION, 0.0, slice(3, 7)), r"action holds a quaternion of norm 0"),
+        (put(keys.ACTION, -1.0, 7), r"action holds a gripper\.pos of -1.*0 \(closed\) to 1"),
     ],
-    ids=["NaN", "zero quaternion"],
+    ids=["NaN", "zero quaternion", "signed gripper"],
 )
 def test_targets_that_would_spoil_the_weights_are_refused(
     spoil: Callable[[dict[str, Any]], None], message: str
