@@ -121,7 +121,7 @@ def test_one_softmax_over_all_views_is_that_of_the_only_view_that_shows_anything
 
 
 def test_fused_map_without_attention_is_the_mean_of_the_views_that_show_something() -> None:
-    net = tiny_net(views=TOGETHER["mean"])
+    net = tiny_net(views=TOGETHER["mean"], proprioception=False)
     seen = scene(net)
     seen.depth[0, 1] = 0
     encoding = net.encode(seen)
@@ -132,7 +132,7 @@ def test_fused_map_without_attention_is_the_mean_of_the_views_that_show_somethin
 
 
 def test_tokens_of_every_view_are_kept_but_for_one_that_shows_nothing() -> None:
-    net = tiny_net(views=TOGETHER["tokens"])
+    net = tiny_net(views=TOGETHER["tokens"], proprioception=False)
     seen = scene(net)
     seen.depth[0, 1] = 0
     encoding = net.encode(seen)
@@ -157,7 +157,7 @@ def test_past_steps_change_decisions_exactly_if_history_is_on(variant: str) -> N
     rows, other = window(4), window(4, seed=7)
     images = {n: torch.cat([getattr(other, n)[:3], getattr(rows, n)[3:]]) for n in ("rgb", "depth")}
     changed = replace(rows, **images, **walked(torch.cat([other.tool[:3, -1], rows.tool[3:, -1]])))
-    last = {n: getattr(rows, n)[3:] for n in ("rgb", "depth", "intrinsics", "extrinsics")}
+    last = {n: getattr(rows, n)[3:] for n in ("rgb", "depth", "intrinsics", "extrinsics", "turn", "opening")}
     alone = replace(rows, real=torch.ones(1, 1, dtype=torch.bool), **last, **walked(rows.tool[3:, -1]))
     expected = replay(net, rows).at(torch.tensor([3]))
     for past in (replay(net, changed).at(torch.tensor([3])), replay(net, alone)):
