@@ -131,7 +131,7 @@ class HistMVConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> list[int]:
-        """Steps from s before to s after the drawn one, from which the policy picks a window."""
+        """Steps from s before to s after the drawn one: what is learned of them, ``windows.look_back`` says."""
         return list(range(-self.network.history.past_steps, self.network.history.past_steps + 1))
 
     @property

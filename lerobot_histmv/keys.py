@@ -21,6 +21,8 @@ ROW = "index"
 POSITION_NAMES = ("ee.x.pos", "ee.y.pos", "ee.z.pos")
 QUATERNION_NAMES = ("ee.qw.pos", "ee.qx.pos", "ee.qy.pos", "ee.qz.pos")
 GRIPPER_NAME = "gripper.pos"
+GRIPPER_SLACK = 0.05
+"""How far a gripper may lie outside of 0 (closed) to 1 (open): measured openings overshoot a little."""
 POSE_NAMES = (*POSITION_NAMES, *QUATERNION_NAMES, GRIPPER_NAME)
 """Eight numbers of an action, and the first eight of the state: tool position [m], quaternion, gripper (1 open)."""
 

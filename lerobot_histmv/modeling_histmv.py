@@ -93,7 +93,10 @@ class HistMVPolicy(PreTrainedPolicy):
         try:
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except RuntimeError as error:
-            raise ValueError(f"checkpoint {model_file} was made with another configuration: {error}") from error
+            raise ValueError(
+                f"checkpoint {model_file} was made with another configuration, or by an older version (CHANGELOG.md tells "
+                f"what such checkpoints need): {error}"
+            ) from error
 
     def generate_model_card(
         self,
@@ -122,7 +125,7 @@ class HistMVPolicy(PreTrainedPolicy):
         self.last_decision: Decision | None = None
 
     def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Loss over every real step of the windows, each row of the dataset counting once.
+        """Loss over every row of the windows whose whole history is there, each row of the dataset counting once.
 
         Args:
             batch: 2s + 1 rows around each drawn row, as LeRobot's loader and the preprocessor give them.

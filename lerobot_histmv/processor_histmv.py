@@ -31,8 +31,6 @@ from lerobot_histmv.geometry import UNIT_TOLERANCE
 
 METRE_LIMIT = 20.0
 """Depth whose largest value lies below this [mm] was surely meant in metres."""
-OPENING_TOLERANCE = 0.05
-"""How far beyond closed (0) or open (1) a gripper may be measured."""
 
 
 @dataclass
@@ -188,10 +186,10 @@ def check_gripper(key: str, vectors: Tensor) -> None:
     """Raise ValueError if gripper openings or commands (component 7) are not those of ``keys.GRIPPER_NAME``."""
     grippers = vectors[..., 7]
     away = (grippers - 0.5).abs()
-    if (away > 0.5 + OPENING_TOLERANCE).any():
+    if (away > 0.5 + keys.GRIPPER_SLACK).any():
         raise ValueError(
             f"{key} holds a {keys.GRIPPER_NAME} of {float(grippers.flatten()[away.argmax()]):.3g}; it must be from 0 "
-            "(closed) to 1 (open): divide by the opening's range"
+            "(closed) to 1 (open): scale it by its closed and open ends"
         )
 
 

@@ -30,7 +30,7 @@ class Window:
     """The n real rows of b windows of t rows, packed in row-major order.
 
     Args:
-        real: which rows are real; the others lie before an episode's start.
+        real: which rows are real; the others lie before an episode's start or after its end.
         rgb: colours in [0, 1].
         depth: distance along the optical axis [m], 0 where invalid.
         intrinsics: fx, fy, cx, cy [pixels].
@@ -110,11 +110,12 @@ class Window:
 
 
 def look_back(exist: Bool[Tensor, "b t"]) -> tuple[Lookback, Float[Tensor, " r"]]:
-    """Spans of up to s + 1 steps for every row whose whole history is in its window, and its share in the loss.
+    """Spans of up to s + 1 steps for every row known to have its whole history in its window, and its loss's share.
 
-    The first s + 1 rows of an episode are one span: causal attention shows each its own past. A later row has its own,
-    of itself and the s rows before it. Over an epoch, which draws every row once, the shares of a row sum to 1, however
-    many windows show it.
+    Where a window reaches beyond the episode's start, the first s + 1 rows are one span: causal attention shows each
+    its own past. Any later row, and in other windows the drawn one and those after it, has its own, of itself and the s
+    rows before it. Over an epoch, which draws every row once, the shares of a row sum to 1, however many windows show
+    it.
 
     Args:
         exist: which of the rows of each window, from s before to s after the drawn one, lie in its episode.

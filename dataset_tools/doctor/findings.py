@@ -135,6 +135,12 @@ CHECKS = {
         "quaternions have w < 0: the same rotation then appears as q and as -q, between which averages break",
         "flip the sign of those with w < 0; histmv keyframe does it in its labels",
     ),
+    "gripper_range": Check(
+        _E,
+        "a gripper.pos is not from 0 (closed) to 1 (open), as in percent or in metres",
+        "scale state and action alike: (value - closed) / (open - closed)",
+        True,
+    ),
     "action_not_reached": Check(
         _E,
         "commanded poses are not reached by the next state (keyframed) or within half a second (dense)",

@@ -34,6 +34,7 @@ def check_numbers(source: Source, layout: Layout, rows: EpisodeRows) -> list[Fin
     found = doctor_vectors.time_gaps(rows.timestamp, float(source.meta.fps), episode)
     found += instructions(source, rows)
     found += doctor_vectors.repeated_rows(rows.vectors, episode)
+    found += doctor_vectors.gripper_range(rows.vectors, vectors(source.features), episode)
     calibration = check_calibration(layout, rows)
     if columns is not None and not columns.is_joints:
         if not source.is_keyframed:

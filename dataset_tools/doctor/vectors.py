@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from dataset_tools.doctor.findings import Finding
+from lerobot_histmv import keys
 
 LATE = 0.1
 """Share of a frame's time by which a step between time stamps may differ from it."""
@@ -43,6 +44,21 @@ def not_finite(
             which = names[feature][entry] if names[feature] else entry
             count = f", the first of {len(bad)}" if len(bad) > 1 else ""
             found.append(Finding.of("nan", f"{feature}[{which}] is {values[frame, entry]}{count}", episode, frame))
+    return found
+
+
+def gripper_range(
+    vectors: Mapping[str, Float[np.ndarray, "n _"]], names: Mapping[str, Sequence[str]], episode: int
+) -> list[Finding]:
+    """Grippers that bear our own name are from 0, closed, to 1, open."""
+    found = []
+    for feature in (keys.STATE, keys.ACTION):
+        if keys.GRIPPER_NAME in names.get(feature, ()):
+            values = vectors[feature][:, names[feature].index(keys.GRIPPER_NAME)]
+            worst = int(np.abs(values - 0.5).argmax())
+            if abs(values[worst] - 0.5) > 0.5 + keys.GRIPPER_SLACK:
+                message = f"{feature}[{keys.GRIPPER_NAME}] is {values[worst]:.3g}"
+                found.append(Finding.of("gripper_range", message, episode, worst))
     return found
 
 

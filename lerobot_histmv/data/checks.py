@@ -84,6 +84,14 @@ def check_dataset(meta: Any, columns: Mapping[str, np.ndarray]) -> None:
         if key in columns and set(keys.QUATERNION_NAMES) <= set(names):
             components = [names.index(name) for name in keys.QUATERNION_NAMES]
             geometry.unit_quaternion(columns[key][:, components], f"{key} of {meta.root}: quaternion")
+        if key in columns and keys.GRIPPER_NAME in names:
+            gripper = columns[key][:, names.index(keys.GRIPPER_NAME)]
+            row = int(np.abs(gripper - 0.5).argmax())
+            if abs(gripper[row] - 0.5) > 0.5 + keys.GRIPPER_SLACK:
+                raise ValueError(
+                    f"{key} of {meta.root} holds a {keys.GRIPPER_NAME} of {gripper[row]:.3g} in row {row}, episode "
+                    f"{episodes[row]}; it must be from 0 (closed) to 1 (open): run `histmv doctor` on the dataset"
+                )
 
 
 def check_files(root: Path) -> None:

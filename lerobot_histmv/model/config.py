@@ -215,8 +215,8 @@ class LossConfig:
         action: lambda_1, weight of position + rotation + gripper.
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
-        approach: factor on distances along the tool's z axis when the pixels nearest the target are sought: a pose over
-            an object is about that object, not about a gripper at its side. 1 measures all directions alike.
+        approach: factor on distances along the key pose's z axis when the pixels nearest it are sought: a pose over an
+            object is about that object, not about a gripper at its side. 1 measures all directions alike.
         choice: weight of the term that teaches the view weights which view decodes best.
         paraphrase: weight of the term that teaches a trained text tower which sentences mean the same.
         gripper: "bce" or "mse" (as printed).

@@ -36,6 +36,10 @@ class Lookback:
         """Spans whose real steps lie packed in row-major order; all are asked for."""
         return cls(pack(real), real, real)
 
+    def alone(self) -> "Lookback":
+        """The decided steps, once nothing but them is kept, without any history."""
+        return self.over(torch.ones_like(self.decided, dtype=torch.bool)[:, None])
+
     def newest(self) -> "Lookback":
         """The same spans, each asked for its last step only."""
         return replace(self, asked=self.real & (step_index(self.real) == self.real.sum(dim=1, keepdim=True) - 1))

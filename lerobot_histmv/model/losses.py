@@ -1,7 +1,6 @@
 """Named loss terms and their weighted sum (paper Eq. 9)."""
 
 import torch
-from einops import einsum
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
@@ -12,9 +11,9 @@ from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.rotations import matrix_of
 
 HEAT_SIGMA = 0.015
-"""Width [m] of the heat map's target around the surface point nearest the true position."""
+"""Width [m] of the heat map's target around the surface point nearest the true position, across the approach axis."""
 HEAT_REACH = 0.15
-"""Farthest [m] that surface may be: beyond it, the view is taken not to show what matters."""
+"""Farthest [m] that surface may be, across that axis: beyond it, the view is taken not to show what matters."""
 
 
 def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
@@ -39,15 +38,14 @@ def heat_loss(
         log_heat: log-probabilities of the pixels.
         cloud: their world coordinates [m].
         target: position [m] and quaternion wxyz of the key pose.
-        approach: factor on distances along the pose's z axis.
+        approach: factor on distances along the pose's z axis, for nearness, reach and width alike.
     """
     seen = log_heat > -torch.inf
     distance = squared_distances(cloud, target[:, :3])
     if approach != 1:
-        axis = matrix_of(target[:, 3:])[..., 2]
-        along = (
-            einsum(axis, cloud, "m c, m c y x -> m y x") - einsum(axis, target[:, :3], "m c, m c -> m")[:, None, None]
-        )
+        # Element by element, as autocast would round a matrix product to a hundredth of the distance.
+        axis = matrix_of(target[:, 3:])[..., 2, None, None]
+        along = (axis * (cloud - target[:, :3, None, None])).sum(dim=1)
         distance = distance - (1 - approach**2) * along.square()
     distance = distance.masked_fill_(~seen, torch.inf).flatten(1)
     near = distance.amin(dim=1) < HEAT_REACH**2

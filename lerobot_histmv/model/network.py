@@ -56,6 +56,10 @@ class Observation:
     text: Float[Tensor, "n c"]
     clip: Float[Tensor, "n k g"] | None = None
 
+    def at(self, steps: Int[Tensor, " r"]) -> "Observation":
+        """The given steps."""
+        return Observation(**{name: None if values is None else values[steps] for name, values in vars(self).items()})
+
 
 @dataclass
 class Encoding:
@@ -142,6 +146,8 @@ class HistMVNet(nn.Module):
         Returns the encoding of the steps asked for, the decoded (step, view) pairs, the pairs, which count these steps,
         and each pair's share of its step's loss.
         """
+        if not self.config.history.memory:
+            seen, lookback = seen.at(lookback.decided), lookback.alone()
         encoding = self.encode(seen)
         enriched = self.remember(encoding.fused, seen.text, lookback)
         encoding = encoding.at(lookback.decided)
@@ -179,10 +185,6 @@ class HistMVNet(nn.Module):
         self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], lookback: Lookback
     ) -> Float[Tensor, "r d kh w"]:
         """History-enriched maps of the r steps asked for, from all n."""
-        if not self.config.history.memory:  # every step is a span of its own
-            decided = lookback.decided
-            lookback = Lookback.over(torch.ones_like(decided, dtype=torch.bool)[:, None])
-            fused, text = fused[decided], text[decided]
         last = (lookback.rows * lookback.real).amax(dim=1)
         return self.history(fused[lookback.rows], text[last], lookback.real)[lookback.asked]
 

@@ -47,6 +47,7 @@ def _value(key: str, feature: dict[str, Any], chance: np.random.Generator) -> An
     value = chance.normal(size=feature["shape"])
     if key in (keys.ACTION, keys.STATE):
         value[3:7] /= np.linalg.norm(value[3:7])
+        value[7] = chance.uniform()
     return (10 * value if feature["dtype"] == "int64" else value).astype(feature["dtype"])
 
 

@@ -177,6 +177,15 @@ def test_quaternions_must_be_unit(root: Path, tmp_path: Path) -> None:
         install(sample.load(bad))
 
 
+@pytest.mark.parametrize("key", [keys.STATE, keys.ACTION])
+def test_grippers_must_lie_between_closed_and_open(key: str, root: Path, tmp_path: Path) -> None:
+    still = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    install(sample.load(damaged(root, tmp_path / "little", key, 5, [*still, 1.04])))
+    bad = damaged(root, tmp_path / "far", key, 5, [*still, 87.0])
+    with pytest.raises(ValueError, match=rf"{key} of .* holds a gripper\.pos of 87 in row 5, episode 2; it must be"):
+        install(sample.load(bad))
+
+
 def test_rows_must_match_the_metadata(root: Path, tmp_path: Path) -> None:
     bad = damaged(root, tmp_path, "episode_index", 2, 1)
     with pytest.raises(ValueError, match=r"episode 0 of .* has 2 rows, but its metadata says 3"):

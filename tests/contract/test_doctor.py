@@ -100,6 +100,7 @@ BROKEN: list[tuple[str, Spoil]] = [
     ("quaternion_norm", numbers(keys.STATE, scaled(3, 7, 0.9))),
     ("quaternion_order", tool(as_xyzw)),
     ("quaternion_sign", tool(flip_odd)),
+    ("gripper_range", tool(scaled(7, 8, 100.0))),
     ("action_not_reached", numbers(keys.ACTION, scaled(0, 3, 0.1))),
     ("action_not_reached", numbers(keys.ACTION, lambda values: np.copyto(values[:, 3:7], [0, 1, 0, 0]))),
     ("intrinsics_size", numbers(keys.INTRINSICS, scaled(0, 4, 5.0))),

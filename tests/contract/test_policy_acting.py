@@ -91,6 +91,10 @@ def test_training_learns_the_decisions_that_acting_makes(policy: HistMVPolicy) -
     learned = drawn - (LONG - 1) + lookback.decided
     assert learned.tolist() == list(range(drawn, drawn + LONG))
     torch.testing.assert_close(predicted.position, actions[learned, :3], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        torch.from_numpy(canonical(predicted.quaternion)).float(), actions[learned, 3:7], atol=1e-5, rtol=0
+    )
+    assert (predicted.gripper > 0).float().equal(actions[learned, 7])
 
 
 def test_decisions_far_beyond_the_window_stay_finite_and_forget_the_oldest_step(policy: HistMVPolicy) -> None:

@@ -173,6 +173,7 @@ SPOILT_OBSERVATIONS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         r"observation\.state.*quaternion of norm 4.*w, x, y, z",
     ),
     "gripper in percent": (put(keys.STATE, 87.0, 7), r"observation\.state.*gripper\.pos of 87.*0 \(closed\) to 1"),
+    "gripper a little too far open": (put(keys.STATE, 1.06, 7), r"observation\.state.*gripper\.pos of 1\.06"),
     "zero quaternion": (put(keys.STATE, 0.0, slice(3, 7)), r"observation\.state.*quaternion of norm 0"),
     "colours of 0 to 255": (scale(FRONT, 255.0), r"observation\.images\.front.*\[0, 1\]"),
     "focal length of 0": (put(keys.INTRINSICS, 0.0, 0), r"camera_intrinsics.*focal"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tiny_scene import SEEN, SIZE, cameras_around, noise_images, tiny_net, tiny_observation
 from torch.nn.functional import pad
 
-from lerobot_histmv.model.config import HistoryConfig, PointsConfig, ViewConfig
+from lerobot_histmv.model.config import DecoderConfig, HistoryConfig, PointsConfig, ViewConfig
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.model.network import HistMVNet, Observation
@@ -214,6 +214,17 @@ def test_the_gripper_s_opening_now_and_before_matters_only_with_proprioception(p
         other = replace(rows, opening=rows.opening.index_fill(0, torch.tensor(step), 0.5))
         first, second = (replay(net, each).position[3] for each in (rows, other))
         assert first.equal(second) != proprioception
+
+
+@pytest.mark.parametrize("tool_frame", [True, False])
+def test_the_tool_s_turn_matters_to_its_own_step_s_rotation_alone(tool_frame: bool) -> None:
+    net = tiny_net(past_steps=4, decoder=DecoderConfig(tool_frame=tool_frame))
+    rows = window(4)
+    other = replace(rows, turn=rows.turn.index_copy(0, torch.tensor([2]), torch.eye(4)[:1]))
+    first, second = replay(net, rows), replay(net, other)
+    turned = [not one.equal(two) for one, two in zip(first.quaternion, second.quaternion, strict=True)]
+    assert turned == [False, False, tool_frame, False]
+    assert_same(replace(second, quaternion=first.quaternion), first)
 
 
 def test_windows_of_different_length_do_not_mix(remembering: HistMVNet) -> None:

@@ -77,6 +77,22 @@ def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_a_gripper_bes
     assert wanted[1][:, -1, -1].min() > 0.99
 
 
+def test_reach_counts_distances_along_the_approach_axis_as_little_as_nearness_does() -> None:
+    uniform, cloud, target = heat_case()
+    target[:, 2], target[:, 3:] = 0.28, torch.eye(4)[0]
+    found = [heat_loss(uniform, cloud, target, factor).gt(0).all().item() for factor in (1.0, 0.5)]
+    assert found == [False, True]
+
+
+def test_half_precision_leaves_the_heat_map_s_target_alone() -> None:
+    uniform, cloud, target = heat_case()
+    target[:, 3:] = torch.nn.functional.normalize(torch.tensor([0.9, 0.3, -0.2, 0.2]), dim=0)
+    cloud, target[:, :3] = cloud + 0.7, target[:, :3] + 0.7
+    with torch.autocast("cpu", torch.bfloat16):
+        half = heat_loss(uniform + cloud[:, 2], cloud, target, approach=0.5)
+    assert half.equal(heat_loss(uniform + cloud[:, 2], cloud, target, approach=0.5))
+
+
 def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
     _, cloud, target = heat_case()
     centimetres = 100 * (cloud - target[:, :3, None, None]).norm(dim=1)
