@@ -94,8 +94,8 @@ class HistMVPolicy(PreTrainedPolicy):
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except RuntimeError as error:
             raise ValueError(
-                f"checkpoint {model_file} was made with another configuration, or by an older version (CHANGELOG.md tells "
-                f"what such checkpoints need): {error}"
+                f"checkpoint {model_file} was made with another configuration, or by an older version (CHANGELOG.md "
+                f"tells what such checkpoints need): {error}"
             ) from error
 
     def generate_model_card(
