@@ -15,6 +15,7 @@ from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from dataset_tools import state
 from dataset_tools.columns import Columns
 from dataset_tools.frames import CameraFrames, camera_frames
 from dataset_tools.images import image_statistics
@@ -49,6 +50,8 @@ def keyframed_features(source: Source, columns: Columns) -> Features:
             features[key]["dtype"] = "image"
         if key in source.depth_keys:
             features[key]["info"] = {"is_depth_map": True, "depth_unit": "mm"}
+    if written := state.names(source.features, columns):
+        features[keys.STATE] = {"dtype": "float32", "shape": (len(written),), "names": list(written)}
     names = label_names(columns)
     features[keys.ACTION] = {"dtype": "float32", "shape": (len(names),), "names": names}
     return features | {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _PROVENANCE.items()}

@@ -63,7 +63,9 @@ def resolve(features: Features, config: ColumnsConfig) -> Columns:
         raise ValueError(f"columns.position is {curve}, {len(curve.indices)} entries; it must be x, y, z")
     rotation, rotation_format = _rotation(features, config, curve.feature)
     commanded = _commanded(features) if config.commanded and rotation else None
-    return Columns(curve, False, rotation, rotation_format, gripper, ends, commanded)
+    opening = _opening(features, gripper, config)
+    measured = _opening_range(features, opening, gripper, config)
+    return Columns(curve, False, rotation, rotation_format, gripper, ends, commanded, opening, measured)
 
 
 def _position(features: Features) -> Column:
@@ -135,18 +137,38 @@ def _gripper(features: Features, config: ColumnsConfig) -> Column | None:
     if config.gripper == NONE:
         return None
     if config.gripper:
-        column = parse(features, config.gripper, "gripper")
-        if len(column.indices) != 1:
-            raise ValueError(f"columns.gripper is {column}, {len(column.indices)} entries; it must be one")
-        return column
+        return _entry(features, config.gripper, "gripper")
+    found = _first_feature(_grippers(features), keys.ACTION)
+    return _only(found, "gripper") if found else None
+
+
+def _opening(features: Features, gripper: Column | None, config: ColumnsConfig) -> Column | None:
+    """As told, else the gripper if that is measured, else the only other one that is."""
+    if config.opening == NONE:
+        return None
+    if config.opening:
+        return _entry(features, config.opening, "opening")
+    if gripper and gripper.feature != keys.ACTION:
+        return gripper
+    found = _first_feature([column for column in _grippers(features) if column.feature != keys.ACTION], keys.STATE)
+    return found[0] if len(found) == 1 else None
+
+
+def _entry(features: Features, text: str, option: str) -> Column:
+    column = parse(features, text, option)
+    if len(column.indices) != 1:
+        raise ValueError(f"columns.{option} is {column}, {len(column.indices)} entries; it must be one")
+    return column
+
+
+def _grippers(features: Features) -> list[Column]:
     found = []
     for key, names in sorted(vectors(features).items(), key=lambda item: item[0] != keys.STATE):
         if features[key]["shape"][0] == 1 and _tokens(key) & _GRIPPER:
             found.append(Column(key, (0,), names))
         else:
             found += [Column(key, (i,), (name,)) for i, name in enumerate(names) if _is_gripper(name)]
-    found = _first_feature(found, keys.ACTION)
-    return _only(found, "gripper") if found else None
+    return found
 
 
 def _gripper_range(features: Features, gripper: Column | None, config: ColumnsConfig) -> tuple[float, float] | None:
@@ -157,6 +179,17 @@ def _gripper_range(features: Features, gripper: Column | None, config: ColumnsCo
     if gripper and set(keys.POSE_NAMES) <= set(entry_names(features[gripper.feature])):
         return 0.0, 1.0
     return None
+
+
+def _opening_range(
+    features: Features, opening: Column | None, gripper: Column | None, config: ColumnsConfig
+) -> tuple[float, float] | None:
+    """Measured closed and open: as told; else as the gripper's where both are one, or bear our own names."""
+    if config.opening_range is not None:
+        closed, opened = config.opening_range
+        return closed, opened
+    ours = opening and set(keys.POSE_NAMES) <= set(entry_names(features[opening.feature]))
+    return _gripper_range(features, opening, config) if ours or opening == gripper else None
 
 
 def _is_gripper(name: str) -> bool:

@@ -33,6 +33,10 @@ class ColumnsConfig:
     gripper: str | None = None
     # Gripper values that mean closed and open, e.g. [0,100]. Default: [0,1] under our own names, else the data's range.
     gripper_range: list[float] | None = None
+    # Measured gripper opening, e.g. observation.state:7 ; `none` takes the command for it. Guessed like the gripper.
+    opening: str | None = None
+    # Measured values that mean closed and open. Default: the gripper's if it is the same column, else the data's range.
+    opening_range: list[float] | None = None
     # Where the arm rests, label with the commanded pose, not the measured one, if the action has our pose names: an arm
     # that pushes against something does not get to where it was told to go.
     commanded: bool = True
@@ -48,9 +52,9 @@ class ColumnsConfig:
             )
         if self.rotation_format and not self.rotation:
             raise ValueError("columns.rotation_format says nothing without columns.rotation; give both")
-        ends = self.gripper_range
-        if ends is not None and (len(ends) != 2 or ends[0] == ends[1]):
-            raise ValueError(f"columns.gripper_range is {ends}; it must be two different numbers: [closed, open]")
+        for name, ends in (("gripper_range", self.gripper_range), ("opening_range", self.opening_range)):
+            if ends is not None and (len(ends) != 2 or ends[0] == ends[1]):
+                raise ValueError(f"columns.{name} is {ends}; it must be two different numbers: [closed, open]")
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,8 @@ class Columns:
         gripper: gripper command, if there is one.
         gripper_range: its values that mean closed and open; None where only the data tell.
         commanded: commanded tool position and rotation (w, x, y, z), if they are to be used.
+        opening: measured gripper opening, if there is one.
+        opening_range: its values that mean closed and open; None where only the data tell.
     """
 
     curve: Column
@@ -90,6 +96,8 @@ class Columns:
     gripper: Column | None
     gripper_range: tuple[float, float] | None
     commanded: tuple[Column, Column] | None = None
+    opening: Column | None = None
+    opening_range: tuple[float, float] | None = None
 
     def chosen(self) -> dict[str, str]:
         """What was chosen, as text."""

@@ -1,9 +1,10 @@
 """The episodes to keyframe, read and understood: which columns mean what, and what the dataset lacks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from dataset_tools import state
 from dataset_tools.column_guesses import resolve
-from dataset_tools.columns import Columns, ColumnsConfig
+from dataset_tools.columns import Column, Columns, ColumnsConfig
 from dataset_tools.signals import Trajectory
 from dataset_tools.source import Source
 from dataset_tools.trajectories import GripperEnds, trajectory_of
@@ -37,7 +38,7 @@ class Demonstrations:
 
     def notices(self) -> list[str]:
         """Sentences about what is missing, assumed or dropped."""
-        return [*self._missing(), *self._assumed(), *self._dropped()]
+        return [*self._missing(), *self._assumed(), *self._rewritten(), *self._dropped()]
 
     def _missing(self) -> list[str]:
         features, columns = self.source.features, self.columns
@@ -68,6 +69,20 @@ class Demonstrations:
             )
         return found
 
+    def _rewritten(self) -> list[str]:
+        """How the state becomes one that the policy reads, if it has to."""
+        columns = self.columns
+        if not state.names(self.source.features, columns):
+            return []
+        told = f"{keys.STATE} begins with {', '.join(keys.POSE_NAMES)}, as the histmv policy reads it"
+        if columns.opening is None or columns.opening_range is None:
+            return [f"{told}; no measured gripper is known, so the opening is the command before the frame"]
+        closed, opened = columns.opening_range
+        return [
+            f"{told}; the opening is {columns.opening}, closed at {closed:g} and open at {opened:g}: the arm's state "
+            "must be made likewise; if these are not the gripper's ends, give --columns.opening_range=[closed,open]"
+        ]
+
     def _dropped(self) -> list[str]:
         source = self.source
         dropped = [key for key in source.features if key not in _REPLACED and not key.startswith(keys.OBS_PREFIX)]
@@ -90,7 +105,11 @@ def understand(source: Source, config: ColumnsConfig) -> Demonstrations:
             "remove it with lerobot-edit-dataset"
         )
     columns = resolve(source.features, config)
-    return Demonstrations(source, columns, gripper_ends(source, columns))
+    ends = gripper_ends(source, columns)
+    if columns.opening and columns.opening_range is None:
+        low, high = observed_range(source, columns.opening)
+        columns = replace(columns, opening_range=(low, high) if ends[0] < ends[1] else (high, low))
+    return Demonstrations(source, columns, ends)
 
 
 def gripper_ends(source: Source, columns: Columns) -> GripperEnds:
@@ -99,9 +118,14 @@ def gripper_ends(source: Source, columns: Columns) -> GripperEnds:
         return 0.0, 1.0
     if columns.gripper_range is not None:
         return columns.gripper_range
+    return observed_range(source, columns.gripper)
+
+
+def observed_range(source: Source, column: Column) -> tuple[float, float]:
+    """Smallest and largest value of a column in all episodes; below and at the only one if all are alike."""
     ranges = []
     for episode in source.episodes:
-        values = columns.gripper.of(source.vectors(episode, [columns.gripper.feature]))
+        values = column.of(source.vectors(episode, [column.feature]))
         ranges.append((float(values.min()), float(values.max())))
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     return (low, high) if low < high else (low - 1, high)

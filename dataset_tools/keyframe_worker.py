@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from dataset_tools import build
+from dataset_tools import build, state
 from dataset_tools.columns import Columns
 from dataset_tools.demonstrations import Demonstrations
 from dataset_tools.keyframe_shards import Keyframed, commit
@@ -20,6 +20,7 @@ from dataset_tools.pool import one_thread_each, serve_parent
 from dataset_tools.replay import Replayer, Scenes
 from dataset_tools.source import Source
 from dataset_tools.trajectories import GripperEnds, labels
+from lerobot_histmv import keys
 
 WORTH_A_PROCESS = 16
 """Episodes for which it pays to start one more process."""
@@ -67,6 +68,8 @@ class Keyframer:
         action = labels(moved, found.keyframes[1:])
         failure = self._replayer.failure(episode, action) if self._replayer else ""
         rows, tasks, warnings = build.rows(source, found, action, episode)
+        if state.names(source.features, job.columns):
+            rows[keys.STATE] = state.values(source.features, job.columns, moved, rows)
         statistics = build.statistics(rows, self._features)
         done = Keyframed(episode, found, failure, tuple(tasks), statistics, tuple(warnings))
         commit(job.directory, done, build.table(rows, self._features))

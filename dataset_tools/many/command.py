@@ -104,6 +104,8 @@ def fully_told(config: KeyframeManyConfig, demonstrations: Demonstrations) -> Ke
     columns: ColumnsConfig = config.columns
     if demonstrations.columns.gripper is not None:
         columns = replace(columns, gripper_range=list(demonstrations.ends))
+    if demonstrations.columns.opening_range is not None:
+        columns = replace(columns, opening_range=list(demonstrations.columns.opening_range))
     names = {name: getattr(config, name) for name in KeyframeConfig.__dataclass_fields__}
     return KeyframeConfig(**{**names, "columns": columns})
 

@@ -58,7 +58,7 @@ class Observation:
 
     def at(self, steps: Int[Tensor, " r"]) -> "Observation":
         """The given steps."""
-        return Observation(**{name: None if values is None else values[steps] for name, values in vars(self).items()})
+        return Observation(**{name: values[steps] for name, values in vars(self).items() if values is not None})
 
 
 @dataclass

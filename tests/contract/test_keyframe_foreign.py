@@ -2,18 +2,22 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.episodes import Frame, image_feature, pick, vector_feature, write
+from helpers.episodes import Frame, dense_features, image_feature, pick, vector_feature, with_cameras, write
 from lerobot.datasets import LeRobotDataset
+from scipy.spatial.transform import Rotation
 
 from dataset_tools.columns import ColumnsConfig
 from dataset_tools.keyframe import KeyframeConfig, OutputConfig, SourceConfig, run
 from lerobot_histmv import keys
+from lerobot_histmv.configuration_histmv import HistMVConfig
+from lerobot_histmv.geometry import canonical
 
 SIZE = (64, 96)
 SHORT = 29
@@ -205,3 +209,58 @@ def test_depth_that_is_no_distance_is_named(tmp_path: Path, value: float) -> Non
     with pytest.raises(ValueError, match=rf"episode 0, frame 0: {DEPTH} holds {value}; depth must be finite"):
         keyframed(dense)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dense"]
+
+
+ROTVEC_STATE = ("temperature", "grip_percent", "tcp_x", "tcp_y", "tcp_z", "tcp_rx", "tcp_ry", "tcp_rz")
+TOLD = ColumnsConfig(rotation="observation.state:5:8", rotation_format="rotvec")
+
+
+def rotvec_arm(root: Path, motion: dict[str, np.ndarray], action: str = "gripper") -> Path:
+    """RGB-D and calibration as ours; in the state a rotation vector, and the gripper in percent, 100 being closed."""
+    count, chance = len(motion["position"]), np.random.default_rng(1)
+    turn = Rotation.from_quat(motion["quaternion"], scalar_first=True).as_rotvec()
+    closed = 100 - 80 * motion["gripper"][:, None]
+    state = np.hstack([chance.uniform(20, 30, (count, 1)), closed, motion["position"], turn]).astype(np.float32)
+    command = 1 - motion["gripper"][:, None].astype(np.float32)
+    features = dense_features() | {keys.STATE: vector_feature(ROTVEC_STATE), keys.ACTION: vector_feature((action,))}
+    return write(root, [with_cameras(frames_with(observation__state=state, action=command), chance)], features)
+
+
+@pytest.mark.parametrize(
+    ("options", "opened"),
+    [({"gripper_range": [1.0, 0.0]}, 1.0), ({"gripper_range": [1.0, 0.0], "opening_range": [100.0, 0.0]}, 0.8)],
+    ids=["its range in the data", "told"],
+)
+def test_a_state_in_another_form_becomes_the_one_that_the_policy_reads(
+    options: dict[str, Any], opened: float, tmp_path: Path
+) -> None:
+    motion = pick(np.random.default_rng(0))
+    keys_of = keyframed(rotvec_arm(tmp_path / "dense", motion), columns=replace(TOLD, **options))
+    HistMVConfig().set_dataset_feature_metadata(keys_of.features)
+    assert keys_of.features[keys.STATE]["names"] == [*keys.POSE_NAMES, "temperature"]
+    for row in keys_of:
+        frame, state = int(row[keys.SOURCE_FRAME]), row[keys.STATE].numpy()
+        np.testing.assert_allclose(state[:3], motion["position"][frame], atol=1e-6)
+        np.testing.assert_allclose(state[3:7], canonical(motion["quaternion"][frame]), atol=1e-6)
+        np.testing.assert_allclose(state[7], opened * motion["gripper"][frame], atol=1e-6)
+        assert 20 <= state[8] <= 30
+    assert min(float(row[keys.STATE][7]) for row in keys_of) == 0
+    assert "begins with ee.x.pos" in notices(keys_of)
+    assert "opening is observation.state:grip_percent, closed at 100" in notices(keys_of)
+
+
+def test_without_a_measured_gripper_the_opening_is_the_command_before_the_frame(tmp_path: Path) -> None:
+    motion = pick(np.random.default_rng(0))
+    columns = replace(TOLD, opening="none", gripper_range=[1.0, 0.0])
+    keys_of = keyframed(rotvec_arm(tmp_path / "dense", motion), columns=columns)
+    openings = {int(row[keys.SOURCE_FRAME]): float(row[keys.STATE][7]) for row in keys_of}
+    assert openings == {frame: motion["gripper"][max(frame - 1, 0)] for frame in openings}
+    assert set(openings.values()) == {0.0, 1.0}
+    assert "no measured gripper is known" in notices(keys_of)
+
+
+def test_a_measured_gripper_outside_of_its_range_is_named(tmp_path: Path) -> None:
+    dense = rotvec_arm(tmp_path / "dense", pick(np.random.default_rng(0)))
+    with pytest.raises(ValueError, match=r"grip_percent is 20, but 100 is closed and 50 open.*opening_range"):
+        keyframed(dense, columns=replace(TOLD, gripper_range=[1.0, 0.0], opening_range=[100.0, 50.0]))
+    assert not (tmp_path / "keys").exists()
