@@ -194,6 +194,7 @@ class DecoderConfig:
     """Parts of the decoders that the paper does not have (3.4).
 
     Args:
+        opening: rotation, offset and gripper also see the measured opening of the gripper, which images show badly.
         tool_frame: rotation is the sum of a part in the world's axes and one in the tool's, six numbers each, and not a
             quaternion: to keep the tool's rotation then is a constant.
         ray: a number of its own moves the key pose along the camera's ray, beside the offset.
@@ -201,6 +202,7 @@ class DecoderConfig:
         peak: when acting, the position is the heat map's expectation near its peak instead of over all pixels.
     """
 
+    opening: bool = True
     tool_frame: bool = True
     ray: bool = True
     local: bool = True
@@ -245,13 +247,10 @@ class NetworkConfig:
     Args:
         width: d, channels of fused feature maps and tokens.
         workspace: lower and upper corner [m] of the box that holds every target; points outside are ignored.
-        proprioception: the measured opening of the gripper is added to every patch of a step: images show too little of
-            whether the gripper holds something, has let it go, or is about to close.
     """
 
     width: int = 64
     workspace: tuple[float, ...] = (-0.05, -0.65, -0.05, 0.95, 0.65, 0.8)
-    proprioception: bool = True
     texture: TextureConfig = field(default_factory=TextureConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     points: PointsConfig = field(default_factory=PointsConfig)

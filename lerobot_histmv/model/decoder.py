@@ -122,15 +122,16 @@ class PoseDecoder(nn.Module):
     """Two convolutions, pooling and two dense layers: offset, rotation, gripper and, with ``ray``, depth.
 
     Beside the paper's pooled map, the dense layers see with ``local`` the decoded map where the heat map points: the
-    turn of an object and the way from its surface to its centre are local.
+    turn of an object and the way from its surface to its centre are local. With ``opening`` they are told how far the
+    gripper is open, which images show badly.
     """
 
     def __init__(self, width: int, config: DecoderConfig) -> None:
         super().__init__()
-        self.local = config.local
+        self.local, self.told = config.local, config.opening
         self.convolve = nn.Sequential(ConvBlock(2 * width, width, stride=2), ConvBlock(width, width))
         self.sizes = [3, 12 if config.tool_frame else 4, 1, int(config.ray)]
-        seen, numbers = 4 * width + LOCAL_CHANNELS * config.local, sum(self.sizes)
+        seen, numbers = 4 * width + LOCAL_CHANNELS * config.local + config.opening, sum(self.sizes)
         self.dense = nn.Sequential(nn.Linear(seen, 2 * width), nn.GELU(), nn.Linear(2 * width, numbers))
 
     def forward(
@@ -139,14 +140,17 @@ class PoseDecoder(nn.Module):
         view: Float[Tensor, "m d h w"],
         decoded: Float[Tensor, "m c y4 x4"],
         heat: Float[Tensor, "m y x"],
+        opening: Float[Tensor, " m"],
     ) -> Float[Tensor, "m e"]:
-        """The numbers from the history map F_t, the view's features FR_t, the decoded map and the heat map."""
+        """The numbers from the history map F_t, the view's features FR_t, the decoded map, heat map and opening."""
         pooled = functional.adaptive_avg_pool2d(self.convolve(torch.cat([maps, view], dim=1)), 2)
-        if not self.local:
-            return self.dense(rearrange(pooled, "m d i j -> m (d i j)"))
-        share = reduce(heat, "m (y i) (x j) -> m y x", "sum", y=decoded.shape[2], x=decoded.shape[3])
-        local = einsum(share, decoded, "m y x, m c y x -> m c")
-        return self.dense(torch.cat([rearrange(pooled, "m d i j -> m (d i j)"), local], dim=-1))
+        seen = [rearrange(pooled, "m d i j -> m (d i j)")]
+        if self.local:
+            share = reduce(heat, "m (y i) (x j) -> m y x", "sum", y=decoded.shape[2], x=decoded.shape[3])
+            seen.append(einsum(share, decoded, "m y x, m c y x -> m c"))
+        if self.told:
+            seen.append(opening[:, None])
+        return self.dense(torch.cat(seen, dim=-1))
 
 
 @dataclass
@@ -183,6 +187,7 @@ class Decoder(nn.Module):
         valid: Bool[Tensor, "m y x"],
         eye: Float[Tensor, "m 3"],
         tool: Float[Tensor, "m 3 3"],
+        opening: Float[Tensor, " m"],
     ) -> Prediction:
         """Decode (step, view) pairs, each from the pixels of its view.
 
@@ -194,10 +199,11 @@ class Decoder(nn.Module):
             valid: pixels with a measurement inside the workspace.
             eye: position of the view's camera [m].
             tool: rotation matrix of the tool at that step.
+            opening: of the gripper, 1 open.
         """
         logits, decoded = self.position(maps, skips, (cloud.shape[-2], cloud.shape[-1]))
         place = self._locate(logits, cloud, valid)
-        return self._predict(place, maps, view, decoded, eye, tool)
+        return self._predict(place, maps, view, decoded, eye, tool, opening)
 
     def together(
         self,
@@ -208,6 +214,7 @@ class Decoder(nn.Module):
         valid: Bool[Tensor, "n k y x"],
         eyes: Float[Tensor, "n k 3"],
         tool: Float[Tensor, "n 3 3"],
+        opening: Float[Tensor, " n"],
         weights: Float[Tensor, "n k"],
     ) -> tuple[Prediction, Float[Tensor, "n k"]]:
         """Decode all views of each step with one softmax over the pixels of all; also each view's share of the heat.
@@ -234,6 +241,7 @@ class Decoder(nn.Module):
             rearrange(decoded, "(n k) c y x -> n c (k y) x", k=k),
             einsum(shares, eyes, "n k, n k c -> n c"),
             tool,
+            opening,
         )
         return predicted, shares
 
@@ -257,6 +265,7 @@ class Decoder(nn.Module):
         decoded: Float[Tensor, "m c y4 x4"],
         eye: Float[Tensor, "m 3"],
         tool: Float[Tensor, "m 3 3"],
+        opening: Float[Tensor, " m"],
     ) -> Prediction:
         """The action at a place.
 
@@ -264,7 +273,7 @@ class Decoder(nn.Module):
         to key pose turns with the camera and has a number of its own beside the offset in the world's axes. Likewise,
         rotation has a part in the tool's axes: many motions keep it, whatever it is.
         """
-        numbers = self.pose(maps, view, decoded, place.heat.detach()).float()
+        numbers = self.pose(maps, view, decoded, place.heat.detach(), opening).float()
         with full_precision(numbers):
             offset, turn, gripper, along = numbers.split(self.pose.sizes, dim=-1)
             if self.config.ray:

@@ -75,6 +75,7 @@ class Encoding:
         weights: view weights w; equal ones where view attention is off.
         eyes: position of every camera [m].
         tool: rotation matrix of the tool.
+        opening: of the gripper, 1 open.
     """
 
     fused: Float[Tensor, "n d kh w"]
@@ -86,6 +87,7 @@ class Encoding:
     weights: Float[Tensor, "n k"]
     eyes: Float[Tensor, "n k 3"]
     tool: Float[Tensor, "n 3 3"]
+    opening: Float[Tensor, " n"]
 
     def at(self, steps: Int[Tensor, " r"]) -> "Encoding":
         """The given steps; the same tensors where they are all, in order."""
@@ -131,8 +133,6 @@ class HistMVNet(nn.Module):
         self.view_attention: ViewAttention | EvenViews = EvenViews()
         if config.views.fusion == "attention":
             self.view_attention = ViewAttention(config.views, config.width, text_width)
-        if config.proprioception:
-            self.opening = nn.Sequential(nn.Linear(1, config.width), nn.GELU(), nn.Linear(config.width, config.width))
         self.fuse = stack_views if config.views.fusion == "tokens" else fuse_views
         self.history = History(config.history, config.width, text_width, grid)
         self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder)
@@ -177,9 +177,8 @@ class HistMVNet(nn.Module):
             maps = self.transfuse(features, self._cell_means(scaled, valid), points)
         weights = self.view_attention(maps, seen.text, valid.any(dim=(-2, -1)))
         fused = self.fuse(maps, weights)
-        if self.config.proprioception:
-            fused = fused + rearrange(self.opening(seen.opening[:, None]), "n d -> n d 1 1")
-        return Encoding(fused, maps, features, skips, cloud, valid, weights, seen.extrinsics[..., 3], tool)
+        eyes = seen.extrinsics[..., 3]
+        return Encoding(fused, maps, features, skips, cloud, valid, weights, eyes, tool, seen.opening)
 
     def remember(
         self, fused: Float[Tensor, "n d kh w"], text: Float[Tensor, "n c"], lookback: Lookback
@@ -199,6 +198,7 @@ class HistMVNet(nn.Module):
             pick(encoding.valid.flatten(0, 1)),
             pick(encoding.eyes.flatten(0, 1)),
             encoding.tool[views[:, 0]],
+            encoding.opening[views[:, 0]],
         )
 
     def decode_best(
@@ -237,6 +237,7 @@ class HistMVNet(nn.Module):
             encoding.valid,
             encoding.eyes,
             encoding.tool,
+            encoding.opening,
             encoding.weights,
         )
         steps = torch.arange(len(shares), device=shares.device)

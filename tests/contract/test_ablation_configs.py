@@ -153,7 +153,6 @@ def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> N
     assert network.points.enabled
     assert network.history.enabled
     assert set(vars(network.decoder).values()) == {False}
-    assert not network.proprioception
     assert loss == LossConfig(
         action=1.0, mutual_information=0.01, heatmap=0.0, choice=0.0, paraphrase=0.0, gripper="mse", position_unit=1.0
     )
@@ -171,6 +170,5 @@ def test_the_peer_has_nothing_of_ours_in_its_network(monkeypatch: pytest.MonkeyP
     assert network.history.enabled
     assert not network.history.skip_first
     assert set(vars(network.decoder).values()) == {False}
-    assert not network.proprioception
     assert (loss.heatmap, loss.position_unit) == (0, 1)
     assert cfg.policy.augment == replace(STILL, pixels=8)

@@ -121,7 +121,7 @@ def test_one_softmax_over_all_views_is_that_of_the_only_view_that_shows_anything
 
 
 def test_fused_map_without_attention_is_the_mean_of_the_views_that_show_something() -> None:
-    net = tiny_net(views=TOGETHER["mean"], proprioception=False)
+    net = tiny_net(views=TOGETHER["mean"])
     seen = scene(net)
     seen.depth[0, 1] = 0
     encoding = net.encode(seen)
@@ -132,7 +132,7 @@ def test_fused_map_without_attention_is_the_mean_of_the_views_that_show_somethin
 
 
 def test_tokens_of_every_view_are_kept_but_for_one_that_shows_nothing() -> None:
-    net = tiny_net(views=TOGETHER["tokens"], proprioception=False)
+    net = tiny_net(views=TOGETHER["tokens"])
     seen = scene(net)
     seen.depth[0, 1] = 0
     encoding = net.encode(seen)

@@ -87,6 +87,7 @@ def inputs(seed: int = 1) -> dict[str, Any]:
         "valid": torch.rand(M, Y, X, generator=generator) < 0.7,
         "eye": torch.randn(M, 3, generator=generator),
         "tool": matrix_of(nn.functional.normalize(torch.randn(M, 4, generator=generator), dim=1)),
+        "opening": torch.rand(M, generator=generator),
     }
 
 
@@ -237,8 +238,8 @@ def together(module: Decoder, steps: list[dict[str, Any]], weights: Tensor) -> t
     names = ("maps", "view", "cloud", "valid", "eye")
     maps, views, cloud, valid, eyes = (torch.stack([given[name] for given in steps]) for name in names)
     skips = [torch.cat(levels) for levels in zip(*(given["skips"] for given in steps), strict=True)]
-    tools = torch.stack([given["tool"][0] for given in steps])
-    return module.together(maps, views, skips, cloud, valid, eyes, tools, weights)
+    tools, openings = (torch.stack([given[name][0] for given in steps]) for name in ("tool", "opening"))
+    return module.together(maps, views, skips, cloud, valid, eyes, tools, openings, weights)
 
 
 @pytest.mark.parametrize("training", [True, False])
