@@ -11,9 +11,9 @@ from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.rotations import matrix_of
 
 HEAT_SIGMA = 0.015
-"""Width [m] of the heat map's target around the surface point nearest the true position, across the approach axis."""
+"""Width [m] of the heat map's target around the surface nearest the true position."""
 HEAT_REACH = 0.15
-"""Farthest [m] that surface may be, across that axis: beyond it, the view is taken not to show what matters."""
+"""Farthest [m] that surface may be: beyond it, the view is taken not to show what matters."""
 
 
 def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
@@ -32,24 +32,27 @@ def heat_loss(
     """Cross-entropy to a Gaussian around the surface nearest the target; 0 where the view sees nothing near it.
 
     Many key poses lie in free space, above the object that they are about: it is the nearest surface. Where the gripper
-    that moves there is nearer, it is not, unless distances along the pose's approach axis count less.
+    that moves there is nearer, it is not, unless distances along the pose's approach axis count less. They do so for
+    what is nearest only: the Gaussian then is around the pose as moved along that axis to the surface found.
 
     Args:
         log_heat: log-probabilities of the pixels.
         cloud: their world coordinates [m].
         target: position [m] and quaternion wxyz of the key pose.
-        approach: factor on distances along the pose's z axis, for nearness, reach and width alike.
+        approach: factor on distances along the pose's z axis when the nearest surface is sought; 1 moves nothing.
     """
     seen = log_heat > -torch.inf
     distance = squared_distances(cloud, target[:, :3])
+    nearest = distance.masked_fill(~seen, torch.inf).flatten(1).amin(dim=1)
     if approach != 1:
         # Element by element, as autocast would round a matrix product to a hundredth of the distance.
         axis = matrix_of(target[:, 3:])[..., 2, None, None]
         along = (axis * (cloud - target[:, :3, None, None])).sum(dim=1)
-        distance = distance - (1 - approach**2) * along.square()
-    distance = distance.masked_fill_(~seen, torch.inf).flatten(1)
-    near = distance.amin(dim=1) < HEAT_REACH**2
-    wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
+        across = distance - along.square()
+        nearest, pixel = (across + (approach * along).square()).masked_fill(~seen, torch.inf).flatten(1).min(dim=1)
+        distance = across + (along - along.flatten(1).gather(1, pixel[:, None])[:, :, None]).square()
+    near = nearest < HEAT_REACH**2
+    wanted = (-0.5 * distance.masked_fill(~seen, torch.inf).flatten(1)[near] / HEAT_SIGMA**2).softmax(dim=1)
     log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
     return torch.zeros_like(log_heat[:, 0, 0]).masked_scatter(near, -(wanted * log_seen).sum(dim=1))
 
