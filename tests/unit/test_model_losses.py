@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -54,16 +55,19 @@ def test_heat_loss_of_a_key_pose_above_the_surface_wants_the_pixels_below_it() -
     torch.testing.assert_close(heat_loss(log_heat, cloud, target + heights), heat_loss(log_heat, cloud, target))
 
 
-def test_distances_along_the_approach_axis_count_less() -> None:
-    """The loss is that of plain distances in a world that is squeezed along the key pose's z axis."""
+def test_the_target_is_around_the_pose_moved_along_its_axis_to_the_surface_nearest_in_a_squeezed_world() -> None:
     log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
     cloud, target = torch.rand(M, 3, Y, X, generator=torch.Generator().manual_seed(1)) / 10, heat_case()[2]
-    rotation = torch.from_numpy(Rotation.from_quat(target[:, 3:].numpy(), scalar_first=True).as_matrix()).float()
-    offset = torch.einsum("mij,miyx->mjyx", rotation, cloud - target[:, :3, None, None])
-    squeezed = offset * torch.tensor([1, 1, 0.3])[:, None, None]
-    plain = heat_loss(log_heat, squeezed, torch.zeros_like(target))
-    torch.testing.assert_close(heat_loss(log_heat, cloud, target, approach=0.3), plain, atol=1e-5, rtol=1e-4)
-    assert not torch.allclose(heat_loss(log_heat, cloud, target), plain, atol=1e-3)
+    moved = target.clone()
+    for one, points in zip(moved, cloud.flatten(2).mT.double().numpy(), strict=True):
+        axis = Rotation.from_quat(one[3:].numpy(), scalar_first=True).as_matrix()[:, 2]
+        offsets = points - one[:3].numpy()
+        along = offsets @ axis
+        squeezed = offsets - (1 - 0.3) * along[:, None] * axis
+        one[:3] += torch.from_numpy(along[np.linalg.norm(squeezed, axis=1).argmin()] * axis)
+    found = heat_loss(log_heat, cloud, target, approach=0.3)
+    torch.testing.assert_close(found, heat_loss(log_heat, cloud, moved), atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(found, heat_loss(log_heat, cloud, target), atol=1e-3)
 
 
 def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_a_gripper_beside_the_pose() -> None:
