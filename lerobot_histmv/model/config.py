@@ -217,8 +217,8 @@ class LossConfig:
         action: lambda_1, weight of position + rotation + gripper.
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
-        approach: factor on distances along the key pose's z axis when the pixels nearest it are sought: a pose over an
-            object is about that object, not about a gripper at its side. 1 measures all directions alike.
+        approach: distance [m] from the key pose's z axis within which the surface nearest it is sought first: a pose
+            over an object is about that object, not about a gripper at its side. 0 seeks everywhere at once.
         choice: weight of the term that teaches the view weights which view decodes best.
         paraphrase: weight of the term that teaches a trained text tower which sentences mean the same.
         gripper: "bce" or "mse" (as printed).
@@ -228,7 +228,7 @@ class LossConfig:
     action: float = 1.0
     mutual_information: float = 0.01
     heatmap: float = 0.5
-    approach: float = 0.5
+    approach: float = 0.05
     choice: float = 0.1
     paraphrase: float = 1.0
     gripper: str = "bce"
@@ -236,8 +236,8 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         require("loss.gripper", self.gripper, ("bce", "mse"))
-        if not 0 < self.approach <= 1:
-            raise ValueError(f"loss.approach={self.approach} is a factor and must be above 0 and at most 1")
+        if not 0 <= self.approach < 1:
+            raise ValueError(f"loss.approach={self.approach} is a distance in metres and must be at least 0 and below 1")
 
 
 @dataclass(frozen=True)

@@ -27,32 +27,31 @@ def heat_loss(
     log_heat: Float[Tensor, "m y x"],
     cloud: Float[Tensor, "m 3 y x"],
     target: Float[Tensor, "m 7"],
-    approach: float = 1.0,
+    approach: float = 0.0,
 ) -> Float[Tensor, " m"]:
     """Cross-entropy to a Gaussian around the surface nearest the target; 0 where the view sees nothing near it.
 
     Many key poses lie in free space, above the object that they are about: it is the nearest surface. Where the gripper
-    that moves there is nearer, it is not, unless distances along the pose's approach axis count less. They do so for
-    what is nearest only: the Gaussian then is around the pose as moved along that axis to the surface found.
+    that moves there is nearer, it is not: so what lies on the pose's approach axis comes first.
 
     Args:
         log_heat: log-probabilities of the pixels.
         cloud: their world coordinates [m].
         target: position [m] and quaternion wxyz of the key pose.
-        approach: factor on distances along the pose's z axis when the nearest surface is sought; 1 moves nothing.
+        approach: distance [m] from the pose's z axis within which surface is sought first; 0 seeks everywhere at once.
     """
     seen = log_heat > -torch.inf
-    distance = squared_distances(cloud, target[:, :3])
-    nearest = distance.masked_fill(~seen, torch.inf).flatten(1).amin(dim=1)
-    if approach != 1:
+    distance = squared_distances(cloud, target[:, :3]).masked_fill_(~seen, torch.inf)
+    if approach:
         # Element by element, as autocast would round a matrix product to a hundredth of the distance.
         axis = matrix_of(target[:, 3:])[..., 2, None, None]
         along = (axis * (cloud - target[:, :3, None, None])).sum(dim=1)
-        across = distance - along.square()
-        nearest, pixel = (across + (approach * along).square()).masked_fill(~seen, torch.inf).flatten(1).min(dim=1)
-        distance = across + (along - along.flatten(1).gather(1, pixel[:, None])[:, :, None]).square()
-    near = nearest < HEAT_REACH**2
-    wanted = (-0.5 * distance.masked_fill(~seen, torch.inf).flatten(1)[near] / HEAT_SIGMA**2).softmax(dim=1)
+        ahead = distance.masked_fill(distance - along.square() > approach**2, torch.inf)
+        found = ahead.amin(dim=(1, 2), keepdim=True) < HEAT_REACH**2
+        distance = torch.where(found, ahead, distance)
+    distance = distance.flatten(1)
+    near = distance.amin(dim=1) < HEAT_REACH**2
+    wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
     log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
     return torch.zeros_like(log_heat[:, 0, 0]).masked_scatter(near, -(wanted * log_seen).sum(dim=1))
 
