@@ -237,7 +237,9 @@ class LossConfig:
     def __post_init__(self) -> None:
         require("loss.gripper", self.gripper, ("bce", "mse"))
         if not 0 <= self.approach < 1:
-            raise ValueError(f"loss.approach={self.approach} is a distance in metres and must be at least 0 and below 1")
+            raise ValueError(
+                f"loss.approach={self.approach} is a distance in metres and must be at least 0 and below 1"
+            )
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from lerobot_histmv.model.network import HistMVNet
         ),
         (lambda: ViewConfig(fusion="mean", mi_gradient=True), r"views\.mi_gradient=True.*views\.fusion='mean'"),
         (lambda: ViewConfig(fusion="tokens", mi_loss="text"), r"views\.mi_loss='text'.*views\.fusion='tokens'"),
-        (lambda: LossConfig(approach=0.0), r"loss\.approach=0\.0.*above 0"),
+        (lambda: LossConfig(approach=-0.1), r"loss\.approach=-0\.1.*at least 0 and below 1"),
         (lambda: LossConfig(gripper="l1"), r"loss\.gripper='l1'.*'bce', 'mse'"),
         (lambda: NetworkConfig(width=30), r"width \(30\).*history\.heads \(4\)"),
         (lambda: NetworkConfig(workspace=(0.0, 0.0, 0.0, 1.0, -1.0, 1.0)), r"workspace=.*lower < upper"),
