@@ -1,5 +1,6 @@
 """Runs a function in fresh processes, alone or as the ranks of one process group, without importing LeRobot anew."""
 
+import faulthandler
 import logging
 import multiprocessing
 import os
@@ -51,12 +52,19 @@ def _run(rank: int, count: int, port: int, log: Path, function: Callable[..., No
     with log.open("a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+        # Where a rank hangs, the log shall say; its end as a process, in which torch's threads may wait for each other
+        # after all is done, is none of the tests' business.
+        faulthandler.dump_traceback_later(0.9 * PATIENCE)
+        failed = 0
         try:
             function(rank, *arguments)
         except BaseException:
+            failed = 1
             traceback.print_exc()
-            logging.shutdown()
-            os._exit(1)
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(failed)
 
 
 def lerobot_train(_: int, words: Sequence[str]) -> None:
