@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from lerobot_histmv.model.config import DecoderConfig, HistoryConfig, PointsConfig, ViewConfig
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.history import Lookback
-from lerobot_histmv.model.network import HistMVNet, Observation
+from lerobot_histmv.model.network import Encoding, HistMVNet, Observation
 from lerobot_histmv.windows import Window, past_tools
 
 K = 3
@@ -226,6 +226,22 @@ def test_the_tool_s_turn_matters_to_its_own_step_s_rotation_alone(tool_frame: bo
     turned = [not one.equal(two) for one, two in zip(first.quaternion, second.quaternion, strict=True)]
     assert turned == [False, False, tool_frame, False]
     assert_same(replace(second, quaternion=first.quaternion), first)
+
+
+def test_without_memory_only_the_rows_asked_for_are_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    net, rows = tiny_net(history=HistoryConfig(enabled=False, layers=2, heads=2)), window(4)
+    seen = rows.observe(net.semantics.text(["lift the cube"], torch.device("cpu")))
+    expected, encode, encoded = replay(net, rows), net.encode, []
+
+    def count(steps: Observation) -> Encoding:
+        encoded.append(len(steps.depth))
+        return encode(steps)
+
+    monkeypatch.setattr(net, "encode", count)
+    with torch.no_grad():
+        found = net(seen, Lookback.over(rows.real).newest(), "best")[1]
+    assert encoded == [1]
+    assert_same(found, expected.at(torch.tensor([3])))
 
 
 def test_windows_of_different_length_do_not_mix(remembering: HistMVNet) -> None:
