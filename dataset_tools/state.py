@@ -9,6 +9,7 @@ from jaxtyping import Float, Float32, Int64
 from dataset_tools.columns import Columns, Features, entry_names, vectors
 from dataset_tools.signals import Trajectory
 from lerobot_histmv import keys
+from lerobot_histmv.data.checks import odd_gripper
 
 
 def names(features: Features, columns: Columns) -> tuple[str, ...]:
@@ -58,8 +59,7 @@ def _opening(
     closed, opened = columns.opening_range
     measured = columns.opening.of({columns.opening.feature: rows[columns.opening.feature]})[:, 0]
     opening = (measured - closed) / (opened - closed)
-    worst = int(np.abs(opening - 0.5).argmax())
-    if abs(opening[worst] - 0.5) > 0.5 + keys.GRIPPER_SLACK:
+    if (worst := odd_gripper(opening)) is not None:
         raise ValueError(
             f"episode {rows[keys.SOURCE_EPISODE][0]}, frame {frames[worst]}: {columns.opening} is {measured[worst]:g}, "
             f"but {closed:g} is closed and {opened:g} open; give --columns.opening_range=[closed,open]"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.lib
 import pyarrow.parquet
+from jaxtyping import Float
 from lerobot.configs import DEPTH_MILLIMETER_UNIT
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.transforms import ImageTransformsConfig
@@ -86,12 +87,18 @@ def check_dataset(meta: Any, columns: Mapping[str, np.ndarray]) -> None:
             geometry.unit_quaternion(columns[key][:, components], f"{key} of {meta.root}: quaternion")
         if key in columns and keys.GRIPPER_NAME in names:
             gripper = columns[key][:, names.index(keys.GRIPPER_NAME)]
-            row = int(np.abs(gripper - 0.5).argmax())
-            if abs(gripper[row] - 0.5) > 0.5 + keys.GRIPPER_SLACK:
+            if (odd := odd_gripper(gripper)) is not None:
                 raise ValueError(
-                    f"{key} of {meta.root} holds a {keys.GRIPPER_NAME} of {gripper[row]:.3g} in row {row}, episode "
-                    f"{episodes[row]}; it must be from 0 (closed) to 1 (open): run `histmv doctor` on the dataset"
+                    f"{key} of {meta.root} holds a {keys.GRIPPER_NAME} of {gripper[odd]:.3g} in row {odd}, episode "
+                    f"{episodes[odd]}; it must be from 0 (closed) to 1 (open): run `histmv doctor` on the dataset"
                 )
+
+
+def odd_gripper(gripper: Float[np.ndarray, " n"]) -> int | None:
+    """Index of the opening or command furthest outside of 0 (closed) to 1 (open), if it is beyond the slack."""
+    away = np.abs(gripper - 0.5)
+    worst = int(away.argmax())
+    return worst if away[worst] > 0.5 + keys.GRIPPER_SLACK else None
 
 
 def check_files(root: Path) -> None:
