@@ -45,7 +45,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "own_clip_frozen": (OWN_CLIP,),
     "quaternion": ("--policy.network.decoder.tool_frame=false",),
     "untold": ("--policy.network.decoder.opening=false",),
-    "plain_heat": ("--policy.loss.approach=0",),
+    "nearest_surface": ("--policy.loss.approach=[0,0,0]",),
     "no_heatmap_loss": ("--policy.loss.heatmap=0",),
     "one_view": (ONE_VIEW,),
     **{f"one_view_{choice}": (ONE_VIEW, f"{CHOICE}={choice}") for choice in ("argmax", "sampled", "expected")},

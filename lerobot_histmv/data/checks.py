@@ -22,6 +22,8 @@ COLOUR_TRANSFORMS = frozenset({
     "JPEGCompression", "GaussianPatchBrightness", "RandomShadow", "GammaCorrection", "PlanckianJitter",
 })  # fmt: skip
 """Image transforms, of torchvision and LeRobot, that leave every pixel where depth and calibration say it is."""
+CLEAR_MOVE, CLEAR_SHARE, CLEAR_COUNT = 0.01, 0.75, 5
+"""Length [m] of moves that tell where the tool points, the share of them that must agree, and the fewest."""
 
 
 def check_training(config: TrainPipelineConfig) -> None:
@@ -92,6 +94,29 @@ def check_dataset(meta: Any, columns: Mapping[str, np.ndarray]) -> None:
                     f"{key} of {meta.root} holds a {keys.GRIPPER_NAME} of {gripper[odd]:.3g} in row {odd}, episode "
                     f"{episodes[odd]}; it must be from 0 (closed) to 1 (open): run `histmv doctor` on the dataset"
                 )
+
+
+def check_approach(approach: tuple[float, ...], meta: Any, columns: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError if the tool moves backwards to where it closes: its frame is not the one ``approach`` is in.
+
+    Args:
+        approach: ``loss.approach``, the direction in which the tool points, in its own frame; zeros are not checked.
+        meta: LeRobot's metadata of a keyframed dataset.
+        columns: its columns, rows first.
+    """
+    names = [meta.features[key]["names"][: len(keys.POSE_NAMES)] for key in (keys.STATE, keys.ACTION)]
+    if not any(approach) or any(tuple(found) != keys.POSE_NAMES for found in names):
+        return
+    state, action = columns[keys.STATE], columns[keys.ACTION]
+    closing = (action[:, 7] < 0.5) & (state[:, 7] > action[:, 7] + 0.5)
+    direction = geometry.matrix_from_quaternion(action[closing, 3:7]) @ approach
+    forward = ((action[closing, :3] - state[closing, :3]) * direction).sum(axis=1)
+    if len(forward) >= CLEAR_COUNT and np.quantile(forward, CLEAR_SHARE) < -CLEAR_MOVE:
+        raise ValueError(
+            f"in {(forward < 0).sum()} of the {len(forward)} rows of {meta.root} in which the gripper closes, the tool "
+            f"moves against loss.approach={approach}, from wrist to finger tips in the tool's frame; where "
+            "the tool's z axis points out of the flange it is [0,0,1], and [0,0,0] does without"
+        )
 
 
 def odd_gripper(gripper: Float[np.ndarray, " n"]) -> int | None:

@@ -102,7 +102,8 @@ def _wrap(original: Callable) -> Callable:
         made = _make(original, cfg)
         for dataset in made:
             if dataset is not None:
-                install(dataset)
+                if install(dataset):
+                    checks.check_approach(cfg.policy.loss.approach, dataset.meta, dataset.reader.columns.arrays)
                 reach_back(dataset, cfg.policy.network.history.past_steps)
         return made
 

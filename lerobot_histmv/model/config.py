@@ -1,5 +1,6 @@
 """Sizes and switches of the network, one small frozen part per module; the YAML presets hold only differences."""
 
+import math
 from dataclasses import dataclass, field
 
 
@@ -217,8 +218,9 @@ class LossConfig:
         action: lambda_1, weight of position + rotation + gripper.
         mutual_information: lambda_2.
         heatmap: weight of the optional cross-entropy between heat map and the pixels nearest the target.
-        approach: distance [m] from the key pose's z axis within which the surface nearest it is sought first: a pose
-            over an object is about that object, not about a gripper at its side. 0 seeks everywhere at once.
+        approach: unit vector, in the tool's frame, from the wrist to the finger tips. Surface that the key pose points
+            at is the heat map's target before any that is nearer: a pose over an object is about that object, not about
+            a gripper beside or above it. Three zeros: the nearest surface.
         choice: weight of the term that teaches the view weights which view decodes best.
         paraphrase: weight of the term that teaches a trained text tower which sentences mean the same.
         gripper: "bce" or "mse" (as printed).
@@ -228,7 +230,7 @@ class LossConfig:
     action: float = 1.0
     mutual_information: float = 0.01
     heatmap: float = 0.5
-    approach: float = 0.05
+    approach: tuple[float, ...] = (0.0, 0.0, -1.0)
     choice: float = 0.1
     paraphrase: float = 1.0
     gripper: str = "bce"
@@ -236,10 +238,8 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         require("loss.gripper", self.gripper, ("bce", "mse"))
-        if not 0 <= self.approach < 1:
-            raise ValueError(
-                f"loss.approach={self.approach} is a distance in metres and must be at least 0 and below 1"
-            )
+        if len(self.approach) != 3 or min(abs(math.hypot(*self.approach) - length) for length in (0, 1)) > 1e-3:
+            raise ValueError(f"loss.approach={self.approach} must be three numbers, a unit vector or all of them 0")
 
 
 @dataclass(frozen=True)

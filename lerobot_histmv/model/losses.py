@@ -1,7 +1,7 @@
 """Named loss terms and their weighted sum (paper Eq. 9)."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -14,6 +14,10 @@ HEAT_SIGMA = 0.015
 """Width [m] of the heat map's target around the surface nearest the true position."""
 HEAT_REACH = 0.15
 """Farthest [m] that surface may be: beyond it, the view is taken not to show what matters."""
+AXIS_REACH = 0.04
+"""Distance [m] from the axis through a pose up to which the tool points at surface there: half an open gripper."""
+BEHIND = 0.03
+"""How far [m] behind a pose the tool still points at surface: an object between the fingers reaches up there."""
 
 
 def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
@@ -27,33 +31,42 @@ def heat_loss(
     log_heat: Float[Tensor, "m y x"],
     cloud: Float[Tensor, "m 3 y x"],
     target: Float[Tensor, "m 7"],
-    approach: float = 0.0,
+    approach: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Float[Tensor, " m"]:
-    """Cross-entropy to a Gaussian around the surface nearest the target; 0 where the view sees nothing near it.
+    """Cross-entropy to a Gaussian around the target over the surface; 0 where the view sees nothing near it.
 
-    Many key poses lie in free space, above the object that they are about: it is the nearest surface. Where the gripper
-    that moves there is nearer, it is not: so what lies on the pose's approach axis comes first.
+    Many key poses lie in free space, above the object that they are about: it is the surface that the tool would point
+    at there, and where there is none, the nearest surface. The nearest one alone is often the gripper before it moves.
 
     Args:
         log_heat: log-probabilities of the pixels.
         cloud: their world coordinates [m].
         target: position [m] and quaternion wxyz of the key pose.
-        approach: distance [m] from the pose's z axis within which surface is sought first; 0 seeks everywhere at once.
+        approach: unit vector in which the tool points, in its own frame; zeros take the nearest surface.
     """
     seen = log_heat > -torch.inf
     distance = squared_distances(cloud, target[:, :3]).masked_fill_(~seen, torch.inf)
-    if approach:
-        # Element by element, as autocast would round a matrix product to a hundredth of the distance.
-        axis = matrix_of(target[:, 3:])[..., 2, None, None]
-        along = (axis * (cloud - target[:, :3, None, None])).sum(dim=1)
-        ahead = distance.masked_fill(distance - along.square() > approach**2, torch.inf)
-        found = ahead.amin(dim=(1, 2), keepdim=True) < HEAT_REACH**2
-        distance = torch.where(found, ahead, distance)
+    if any(approach):
+        pointed = distance.masked_fill(~pointed_at(cloud, target, approach), torch.inf)
+        found = pointed.amin(dim=(1, 2), keepdim=True) < HEAT_REACH**2
+        distance = torch.where(found, pointed, distance)
     distance = distance.flatten(1)
     near = distance.amin(dim=1) < HEAT_REACH**2
     wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
     log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
     return torch.zeros_like(log_heat[:, 0, 0]).masked_scatter(near, -(wanted * log_seen).sum(dim=1))
+
+
+def pointed_at(
+    cloud: Float[Tensor, "m 3 y x"], pose: Float[Tensor, "m 7"], approach: tuple[float, ...]
+) -> Bool[Tensor, "m y x"]:
+    """Pixels within ``AXIS_REACH`` of the line along ``approach`` through the pose, from a little behind it on."""
+    # Element by element, as autocast would round a matrix product to a hundredth of the distance.
+    direction = (matrix_of(pose[:, 3:]) * pose.new_tensor(approach)).sum(dim=-1)
+    offset = cloud - pose[:, :3, None, None]
+    ahead = (offset * direction[..., None, None]).sum(dim=1)
+    aside = offset - ahead[:, None] * direction[..., None, None]
+    return (ahead > -BEHIND) & (aside.square().sum(dim=1) < AXIS_REACH**2)
 
 
 PARAPHRASE_TEMPERATURE = 0.1

@@ -3,20 +3,23 @@
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import draccus
 import keyframed_dataset as sample
+import numpy as np
 import pytest
 import torch
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, factory
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
+from scipy.spatial.transform import Rotation
 
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
-from lerobot_histmv.data import hook
+from lerobot_histmv.data import checks, hook
 from lerobot_histmv.data.reader import FrameReader
 from lerobot_histmv.data.resume import ResumedSampler
 from lerobot_histmv.model.config import HistoryConfig, NetworkConfig
@@ -141,3 +144,24 @@ def test_damaged_datasets_are_named(root: Path, tmp_path: Path) -> None:
         lerobot_train.make_train_eval_datasets(configured(copy))
     with pytest.raises(ValueError, match=r"nowhere is no LeRobot dataset: meta/info\.json is missing"):
         lerobot_train.make_train_eval_datasets(configured(tmp_path / "nowhere"))
+
+
+def test_a_tool_frame_that_points_the_other_way_is_refused(tmp_path: Path) -> None:
+    """Five moves of 7 cm along the tool's own z axis, at the end of which the gripper closes."""
+    columns = {key: np.zeros((7, 8), np.float32) for key in (keys.STATE, keys.ACTION)}
+    turns = Rotation.random(7, np.random.default_rng(0))
+    columns[keys.ACTION][:, :3] = 0.07 * turns.apply([0, 0, 1])
+    columns[keys.ACTION][:, 3:7] = turns.as_quat(scalar_first=True)
+    columns[keys.ACTION][5:, :3] *= -1
+    columns[keys.STATE][:5, 7] = 1
+    features = {key: {"names": list(keys.POSE_NAMES)} for key in columns}
+    meta = SimpleNamespace(root=tmp_path, features=features)
+    checks.check_approach((0.0, 0.0, 1.0), meta, columns)
+    checks.check_approach((0.0, 0.0, 0.0), meta, columns)
+    checks.check_approach((0.0, 1.0, 0.0), meta, columns)
+    with pytest.raises(
+        ValueError, match=r"5 of the 5 rows of .* against loss\.approach=\(0\.0, 0\.0, -1\.0\).*\[0,0,1\]"
+    ):
+        checks.check_approach((0.0, 0.0, -1.0), meta, columns)
+    columns[keys.STATE][4, 7] = 0
+    checks.check_approach((0.0, 0.0, -1.0), meta, columns)

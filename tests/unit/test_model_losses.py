@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.losses import (
+    AXIS_REACH,
+    BEHIND,
     PARAPHRASE_TEMPERATURE,
     action_losses,
     heat_loss,
@@ -54,42 +56,51 @@ def test_heat_loss_of_a_key_pose_above_the_surface_wants_the_pixels_below_it() -
     torch.testing.assert_close(heat_loss(log_heat, cloud, target + heights), heat_loss(log_heat, cloud, target))
 
 
-def test_what_lies_within_reach_of_the_approach_axis_comes_first() -> None:
-    """As if all else were far away; unless nothing lies there."""
+def random_case() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Any heat over a cube of 20 cm of points, 0.7 m from the origin, and key poses of any turn in its middle."""
     log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
-    cloud, target = torch.rand(M, 3, Y, X, generator=torch.Generator().manual_seed(1)) / 10, heat_case()[2]
-    rotation = torch.from_numpy(Rotation.from_quat(target[:, 3:].numpy(), scalar_first=True).as_matrix()).float()
-    across = torch.einsum("mij,miyx->mjyx", rotation, cloud - target[:, :3, None, None])[:, :2].norm(dim=1)
-    nearest = across.flatten(1).amin(dim=1)
-    assert nearest.max() < 0.03
-    plain = heat_loss(log_heat, cloud, target)
-    for radius in (0.03, 0.05):
-        alone = cloud + 10 * (across > radius)[:, None]
-        found = heat_loss(log_heat, cloud, target, approach=radius)
-        torch.testing.assert_close(found, heat_loss(log_heat, alone, target), atol=1e-5, rtol=1e-4)
-        assert not torch.allclose(found, plain, atol=1e-3)
-    torch.testing.assert_close(heat_loss(log_heat, cloud, target, approach=0.9 * nearest.min().item()), plain)
+    cloud = 0.7 + torch.rand(M, 3, Y, X, generator=torch.Generator().manual_seed(1)) / 5
+    return log_heat, cloud, torch.cat([torch.full((M, 3), 0.8), unit(M, 2)], dim=1)
 
 
-def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_a_gripper_beside_the_pose() -> None:
-    """Over pixel (2, 3) and pointing down; the last pixel, of a gripper, is 9 cm to the side, at the pose's height."""
+@pytest.mark.parametrize("approach", [(0.0, 0.0, -1.0), (0.6, 0.8, 0.0)])
+def test_surface_that_the_key_pose_points_at_comes_first(approach: tuple[float, ...]) -> None:
+    """As if all else were far away; unless there is none."""
+    log_heat, cloud, target = random_case()
+    turn = torch.from_numpy(Rotation.from_quat(target[:, 3:].numpy(), scalar_first=True).as_matrix()).float()
+    in_tool = torch.einsum("mij,miyx->mjyx", turn, cloud - target[:, :3, None, None])
+    ahead = torch.einsum("mjyx,j->myx", in_tool, torch.tensor(approach))
+    aside = (in_tool.square().sum(dim=1) - ahead.square()).clamp_min(0).sqrt()
+    pointed = (ahead > -BEHIND) & (aside < AXIS_REACH)
+    assert pointed.flatten(1).any(dim=1).all()
+    assert ((aside < AXIS_REACH) & ~pointed).any()
+    alone = cloud + 10 * ~pointed[:, None]
+    found = heat_loss(log_heat, cloud, target, approach)
+    torch.testing.assert_close(found, heat_loss(log_heat, alone, target), atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(found, heat_loss(log_heat, cloud, target), atol=1e-3)
+    others = cloud + 10 * pointed[:, None]
+    torch.testing.assert_close(heat_loss(log_heat, others, target, approach), heat_loss(log_heat, others, target))
+
+
+def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_the_gripper_beside_and_above_it() -> None:
+    """Over pixel (2, 3) and pointing down; the last two pixels, of a gripper, are nearer, aside and behind."""
     uniform, cloud, target = heat_case()
     target[:, 2], target[:, 3:] = 0.13, torch.eye(4)[0]
     cloud[:, :, -1, -1] = target[:, :3] + torch.tensor([0.09, 0.0, 0.0])
+    cloud[:, :, -1, -2] = target[:, :3] + torch.tensor([0.01, 0.0, 0.08])
     steps = uniform.requires_grad_()
-    wanted = [-torch.autograd.grad(heat_loss(steps, cloud, target, radius).sum(), steps)[0] for radius in (0.05, 0.0)]
-    assert wanted[0][:, -1, -1].max() < 0.01, "of a whole of 1"
-    assert wanted[1][:, -1, -1].min() > 0.99
+    for approach, shares in (((0.0, 0.0, -1.0), (0, 0)), ((0.0, 0.0, 1.0), (1, 0)), ((0.0, 0.0, 0.0), (1, 0))):
+        wanted = -torch.autograd.grad(heat_loss(steps, cloud, target, approach).sum(), steps)[0]
+        expected = torch.tensor(shares, dtype=torch.float32).expand(M, 2)
+        torch.testing.assert_close(wanted[:, -1, -2:], expected, atol=0.03, rtol=0)
 
 
 def test_half_precision_leaves_the_heat_map_s_target_alone() -> None:
     """Many points about as far from the axis as is asked: rounded products would take others in."""
-    log_heat = torch.randn(M, Y * X, generator=torch.Generator().manual_seed(0)).log_softmax(dim=1).view(M, Y, X)
-    cloud, target = torch.rand(M, 3, Y, X, generator=torch.Generator().manual_seed(1)) / 10, heat_case()[2]
-    cloud, target[:, :3] = cloud + 0.7, target[:, :3] + 0.7
+    log_heat, cloud, target = random_case()
     with torch.autocast("cpu", torch.bfloat16):
-        half = heat_loss(log_heat, cloud, target, approach=0.03)
-    assert half.equal(heat_loss(log_heat, cloud, target, approach=0.03))
+        half = heat_loss(log_heat, cloud, target, (0.6, 0.8, 0.0))
+    assert half.equal(heat_loss(log_heat, cloud, target, (0.6, 0.8, 0.0)))
 
 
 def test_heat_loss_falls_when_heat_moves_to_the_target() -> None:
