@@ -159,9 +159,7 @@ def test_a_tool_frame_that_points_the_other_way_is_refused(tmp_path: Path) -> No
     checks.check_approach((0.0, 0.0, 1.0), meta, columns)
     checks.check_approach((0.0, 0.0, 0.0), meta, columns)
     checks.check_approach((0.0, 1.0, 0.0), meta, columns)
-    with pytest.raises(
-        ValueError, match=r"5 of the 5 rows of .* against loss\.approach=\(0\.0, 0\.0, -1\.0\).*\[0,0,1\]"
-    ):
+    with pytest.raises(ValueError, match=r"5 of the 5 rows .* against loss\.approach=\(0\.0, 0\.0, -1\.0\).*\[0,0,1\]"):
         checks.check_approach((0.0, 0.0, -1.0), meta, columns)
     columns[keys.STATE][4, 7] = 0
     checks.check_approach((0.0, 0.0, -1.0), meta, columns)
