@@ -8,8 +8,7 @@ from jaxtyping import Float, Float32, Int64
 
 from dataset_tools.columns import Columns, Features, entry_names, vectors
 from dataset_tools.signals import Trajectory
-from lerobot_histmv import keys
-from lerobot_histmv.data.checks import odd_gripper
+from lerobot_histmv import geometry, keys
 
 
 def names(features: Features, columns: Columns) -> tuple[str, ...]:
@@ -59,7 +58,7 @@ def _opening(
     closed, opened = columns.opening_range
     measured = columns.opening.of({columns.opening.feature: rows[columns.opening.feature]})[:, 0]
     opening = (measured - closed) / (opened - closed)
-    if (worst := odd_gripper(opening)) is not None:
+    if (worst := geometry.odd_gripper(opening)) is not None:
         raise ValueError(
             f"episode {rows[keys.SOURCE_EPISODE][0]}, frame {frames[worst]}: {columns.opening} is {measured[worst]:g}, "
             f"but {closed:g} is closed and {opened:g} open; give --columns.opening_range=[closed,open]"

@@ -11,6 +11,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from lerobot_histmv import keys
+
 UNIT_TOLERANCE = 1e-2
 """How far from 1 a quaternion's norm may be before the data is refused."""
 
@@ -30,6 +32,13 @@ def unit_quaternion(quaternion: ArrayLike, what: str = "quaternion") -> Float[np
         worst = q.reshape(-1, 4)[np.nanargmax(np.nan_to_num(np.abs(norm - 1), nan=np.inf).ravel())]
         raise ValueError(f"{what} {worst.tolist()} is not a unit quaternion (w, x, y, z); its norm must be 1")
     return canonical(q / norm)
+
+
+def odd_gripper(gripper: Float[np.ndarray, " n"]) -> int | None:
+    """Index of the opening or command furthest outside of 0 (closed) to 1 (open), if it is beyond the slack."""
+    away = np.abs(gripper - 0.5)
+    worst = int(away.argmax())
+    return worst if away[worst] > 0.5 + keys.GRIPPER_SLACK else None
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Float[np.ndarray, "... 4"]:

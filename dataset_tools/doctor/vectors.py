@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from dataset_tools.doctor.findings import Finding
-from lerobot_histmv import keys
-from lerobot_histmv.data.checks import odd_gripper
+from lerobot_histmv import geometry, keys
 
 LATE = 0.1
 """Share of a frame's time by which a step between time stamps may differ from it."""
@@ -56,7 +55,7 @@ def gripper_range(
     for feature in (keys.STATE, keys.ACTION):
         if keys.GRIPPER_NAME in names.get(feature, ()):
             values = vectors[feature][:, names[feature].index(keys.GRIPPER_NAME)]
-            if (worst := odd_gripper(values)) is not None:
+            if (worst := geometry.odd_gripper(values)) is not None:
                 message = f"{feature}[{keys.GRIPPER_NAME}] is {values[worst]:.3g}"
                 found.append(Finding.of("gripper_range", message, episode, worst))
     return found

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pyarrow.lib
 import pyarrow.parquet
-from jaxtyping import Float
 from lerobot.configs import DEPTH_MILLIMETER_UNIT
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.transforms import ImageTransformsConfig
 
 from lerobot_histmv import geometry, keys
+from lerobot_histmv.model.config import LossConfig
 
 COLOUR_TRANSFORMS = frozenset({
     "Identity", "ColorJitter", "Grayscale", "RandomGrayscale", "RandomPhotometricDistort", "RandomChannelPermutation",
@@ -89,41 +89,34 @@ def check_dataset(meta: Any, columns: Mapping[str, np.ndarray]) -> None:
             geometry.unit_quaternion(columns[key][:, components], f"{key} of {meta.root}: quaternion")
         if key in columns and keys.GRIPPER_NAME in names:
             gripper = columns[key][:, names.index(keys.GRIPPER_NAME)]
-            if (odd := odd_gripper(gripper)) is not None:
+            if (odd := geometry.odd_gripper(gripper)) is not None:
                 raise ValueError(
                     f"{key} of {meta.root} holds a {keys.GRIPPER_NAME} of {gripper[odd]:.3g} in row {odd}, episode "
                     f"{episodes[odd]}; it must be from 0 (closed) to 1 (open): run `histmv doctor` on the dataset"
                 )
 
 
-def check_approach(approach: tuple[float, ...], meta: Any, columns: Mapping[str, np.ndarray]) -> None:
+def check_approach(loss: LossConfig, meta: Any, columns: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError if the tool moves backwards to where it closes: its frame is not the one ``approach`` is in.
 
     Args:
-        approach: ``loss.approach``, the direction in which the tool points, in its own frame; zeros are not checked.
+        loss: of the policy; without heat map term or direction nothing is checked.
         meta: LeRobot's metadata of a keyframed dataset.
         columns: its columns, rows first.
     """
     names = [meta.features[key]["names"][: len(keys.POSE_NAMES)] for key in (keys.STATE, keys.ACTION)]
-    if not any(approach) or any(tuple(found) != keys.POSE_NAMES for found in names):
+    if not loss.heatmap or not any(loss.approach) or any(tuple(found) != keys.POSE_NAMES for found in names):
         return
     state, action = columns[keys.STATE], columns[keys.ACTION]
     closing = (action[:, 7] < 0.5) & (state[:, 7] > action[:, 7] + 0.5)
-    direction = geometry.matrix_from_quaternion(action[closing, 3:7]) @ approach
+    direction = geometry.matrix_from_quaternion(action[closing, 3:7]) @ loss.approach
     forward = ((action[closing, :3] - state[closing, :3]) * direction).sum(axis=1)
     if len(forward) >= CLEAR_COUNT and np.quantile(forward, CLEAR_SHARE) < -CLEAR_MOVE:
         raise ValueError(
             f"in {(forward < 0).sum()} of the {len(forward)} rows of {meta.root} in which the gripper closes, the tool "
-            f"moves against loss.approach={approach}, from wrist to finger tips in the tool's frame; where "
+            f"moves against loss.approach={loss.approach}, from wrist to finger tips in the tool's frame; where "
             "the tool's z axis points out of the flange it is [0,0,1], and [0,0,0] does without"
         )
-
-
-def odd_gripper(gripper: Float[np.ndarray, " n"]) -> int | None:
-    """Index of the opening or command furthest outside of 0 (closed) to 1 (open), if it is beyond the slack."""
-    away = np.abs(gripper - 0.5)
-    worst = int(away.argmax())
-    return worst if away[worst] > 0.5 + keys.GRIPPER_SLACK else None
 
 
 def check_files(root: Path) -> None:

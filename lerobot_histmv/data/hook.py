@@ -103,7 +103,7 @@ def _wrap(original: Callable) -> Callable:
         for dataset in made:
             if dataset is not None:
                 if install(dataset):
-                    checks.check_approach(cfg.policy.loss.approach, dataset.meta, dataset.reader.columns.arrays)
+                    checks.check_approach(cfg.policy.loss, dataset.meta, dataset.reader.columns.arrays)
                 reach_back(dataset, cfg.policy.network.history.past_steps)
         return made
 

@@ -1,6 +1,7 @@
 """Named loss terms and their weighted sum (paper Eq. 9)."""
 
 import torch
+from einops import einsum
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
@@ -8,6 +9,7 @@ from torch.nn import functional
 from lerobot_histmv.model.cameras import squared_distances
 from lerobot_histmv.model.config import LossConfig
 from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.rotations import matrix_of
 
 HEAT_SIGMA = 0.015
@@ -47,7 +49,7 @@ def heat_loss(
     seen = log_heat > -torch.inf
     distance = squared_distances(cloud, target[:, :3]).masked_fill_(~seen, torch.inf)
     if any(approach):
-        pointed = distance.masked_fill(~pointed_at(cloud, target, approach), torch.inf)
+        pointed = distance.masked_fill(~pointed_at(distance, cloud, target, approach), torch.inf)
         found = pointed.amin(dim=(1, 2), keepdim=True) < HEAT_REACH**2
         distance = torch.where(found, pointed, distance)
     distance = distance.flatten(1)
@@ -58,15 +60,20 @@ def heat_loss(
 
 
 def pointed_at(
-    cloud: Float[Tensor, "m 3 y x"], pose: Float[Tensor, "m 7"], approach: tuple[float, ...]
+    distance: Float[Tensor, "m y x"],
+    cloud: Float[Tensor, "m 3 y x"],
+    pose: Float[Tensor, "m 7"],
+    approach: tuple[float, ...],
 ) -> Bool[Tensor, "m y x"]:
-    """Pixels within ``AXIS_REACH`` of the line along ``approach`` through the pose, from a little behind it on."""
-    # Element by element, as autocast would round a matrix product to a hundredth of the distance.
-    direction = (matrix_of(pose[:, 3:]) * pose.new_tensor(approach)).sum(dim=-1)
-    offset = cloud - pose[:, :3, None, None]
-    ahead = (offset * direction[..., None, None]).sum(dim=1)
-    aside = offset - ahead[:, None] * direction[..., None, None]
-    return (ahead > -BEHIND) & (aside.square().sum(dim=1) < AXIS_REACH**2)
+    """Pixels within ``AXIS_REACH`` of the line along ``approach`` through the pose, from a little behind it on.
+
+    ``distance`` is each pixel's squared distance from the pose [m^2], infinite where it does not count.
+    """
+    with full_precision(cloud):
+        direction = (matrix_of(pose[:, 3:]) * pose.new_tensor(approach)).sum(dim=-1)
+        start = (direction * pose[:, :3]).sum(dim=-1)
+        ahead = einsum(direction, cloud, "m c, m c y x -> m y x") - start[:, None, None]
+    return (ahead > -BEHIND) & (distance - ahead.square() < AXIS_REACH**2)
 
 
 PARAPHRASE_TEMPERATURE = 0.1

@@ -22,7 +22,7 @@ from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.data import checks, hook
 from lerobot_histmv.data.reader import FrameReader
 from lerobot_histmv.data.resume import ResumedSampler
-from lerobot_histmv.model.config import HistoryConfig, NetworkConfig
+from lerobot_histmv.model.config import HistoryConfig, LossConfig, NetworkConfig
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +156,10 @@ def test_a_tool_frame_that_points_the_other_way_is_refused(tmp_path: Path) -> No
     columns[keys.STATE][:5, 7] = 1
     features = {key: {"names": list(keys.POSE_NAMES)} for key in columns}
     meta = SimpleNamespace(root=tmp_path, features=features)
-    checks.check_approach((0.0, 0.0, 1.0), meta, columns)
-    checks.check_approach((0.0, 0.0, 0.0), meta, columns)
-    checks.check_approach((0.0, 1.0, 0.0), meta, columns)
+    for allowed in ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
+        checks.check_approach(LossConfig(approach=allowed), meta, columns)
+    checks.check_approach(LossConfig(heatmap=0.0), meta, columns)
     with pytest.raises(ValueError, match=r"5 of the 5 rows .* against loss\.approach=\(0\.0, 0\.0, -1\.0\).*\[0,0,1\]"):
-        checks.check_approach((0.0, 0.0, -1.0), meta, columns)
+        checks.check_approach(LossConfig(), meta, columns)
     columns[keys.STATE][4, 7] = 0
-    checks.check_approach((0.0, 0.0, -1.0), meta, columns)
+    checks.check_approach(LossConfig(), meta, columns)

@@ -15,7 +15,7 @@ SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROO
 ENVS = [path for path in SOURCES if path.match("lerobot_histmv/envs/*.py")]
 ENVS_WITH_LEROBOT = {"configuration_ur5.py", "processor_ur5.py"}
 PURE = {Path("lerobot_histmv/geometry.py"), Path("lerobot_histmv/keys.py"), Path("lerobot_histmv/motion.py")}
-KEYFRAMING = {"signals", "fitness", "genetic", "exact", "simplify", "keyframes"}
+KEYFRAMING = {"signals", "fitness", "genetic", "exact", "simplify", "keyframes", "columns", "state", "vectors"}
 
 RULES: dict[str, tuple[list[Path], set[str]]] = {
     "model and geometry know no LeRobot": (

@@ -95,6 +95,15 @@ def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_the_gripper_b
         torch.testing.assert_close(wanted[:, -1, -2:], expected, atol=0.03, rtol=0)
 
 
+def test_surface_pointed_at_from_too_far_away_does_not_count() -> None:
+    """17 cm below the pose; a pixel 9 cm beside it is what is left."""
+    uniform, cloud, target = heat_case()
+    target[:, 2], target[:, 3:] = 0.17, torch.eye(4)[0]
+    cloud[:, :, -1, -1] = target[:, :3] + torch.tensor([0.09, 0.0, 0.0])
+    found = heat_loss(uniform, cloud, target, (0.0, 0.0, -1.0))
+    torch.testing.assert_close(found, torch.full((M,), math.log(Y * X)))
+
+
 def test_half_precision_leaves_the_heat_map_s_target_alone() -> None:
     """Many points about as far from the axis as is asked: rounded products would take others in."""
     log_heat, cloud, target = random_case()
