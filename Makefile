@@ -3,6 +3,8 @@
 VENV ?= .venv
 OUTPUT ?= outputs/demo
 export VENV
+# Bytecode is kept also where a container's settings forbid it: without, each command of LeRobot compiles for 12 s first.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test lint
 
