@@ -170,11 +170,17 @@ class Decoder(nn.Module):
         width: d.
         skip_channels: channels of a view's levels, fine to coarse.
         config: decoder part of the network's configuration.
+        middle: where a heat map points that no pixel is valid for: the middle of the workspace [m].
     """
 
-    def __init__(self, width: int, skip_channels: list[int], config: DecoderConfig) -> None:
+    middle: Tensor
+
+    def __init__(
+        self, width: int, skip_channels: list[int], config: DecoderConfig, middle: Float[Tensor, " 3"]
+    ) -> None:
         super().__init__()
         self.config = config
+        self.register_buffer("middle", middle, persistent=False)
         self.position = PositionDecoder(width, skip_channels)
         self.pose = PoseDecoder(width, self.config)
 
@@ -248,14 +254,16 @@ class Decoder(nn.Module):
     def _locate(
         self, logits: Float[Tensor, "m y x"], cloud: Float[Tensor, "m 3 y x"], valid: Bool[Tensor, "m y x"]
     ) -> Place:
-        """Heat map and its expectation over the cloud."""
+        """Heat map and its expectation over the cloud; the middle of the workspace where nothing is seen."""
         with full_precision(logits):
             log_heat = spatial_log_softmax(logits.float(), valid)
             heat, certainty = log_heat.exp(), torch.ones_like(log_heat[:, 0, 0])
             if not self.training:  # training needs the gradient from all pixels; acting needs one object
                 near, certainty = around_peak(heat, cloud)
                 heat = near if self.config.peak else heat
-            return Place(einsum(heat, cloud, "m y x, m c y x -> m c"), log_heat, certainty, heat)
+            surface = einsum(heat, cloud, "m y x, m c y x -> m c")
+            seeing = valid.any(dim=-1).any(dim=-1, keepdim=True)
+            return Place(torch.where(seeing, surface, self.middle), log_heat, certainty, heat)
 
     def _predict(
         self,

@@ -135,7 +135,7 @@ class HistMVNet(nn.Module):
             self.view_attention = ViewAttention(config.views, config.width, text_width)
         self.fuse = stack_views if config.views.fusion == "tokens" else fuse_views
         self.history = History(config.history, config.width, text_width, grid)
-        self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder)
+        self.decoder = Decoder(config.width, self.rgba.skip_channels, config.decoder, self.workspace.centre)
         self.config = config
 
     def forward(

@@ -77,11 +77,12 @@ def in_order(seen: Observation, order: list[int]) -> Observation:
 PIXELS = 5
 
 
-@pytest.fixture(scope="module")
-def all_points() -> HistMVNet:
+@pytest.fixture(scope="module", params=["all", "one"])
+def all_points(request: pytest.FixtureRequest) -> HistMVNet:
     """Every one of ``PIXELS`` valid pixels per view becomes a point token, so that no draw interferes."""
     return tiny_net(
-        points=PointsConfig(samples=SIZE[0] * SIZE[1] * K, centres=(K * PIXELS,), radii=(0.2,), neighbours=3)
+        views=ViewConfig(decode=request.param),
+        points=PointsConfig(samples=SIZE[0] * SIZE[1] * K, centres=(K * PIXELS,), radii=(0.2,), neighbours=3),
     )
 
 
@@ -99,7 +100,9 @@ def test_view_order_does_not_matter(all_points: HistMVNet, order: list[int]) -> 
     permuted_weights, permuted_predicted, permuted_view = decide(all_points, in_order(seen, order))
     torch.testing.assert_close(permuted_weights, weights[:, order], atol=1e-5, rtol=0)
     assert torch.tensor(order)[permuted_view].equal(view)
-    heat = predicted.log_heat.unflatten(1, (K, -1))[:, order].flatten(1, 2)
+    heat = predicted.log_heat
+    if all_points.config.views.decode == "all":
+        heat = heat.unflatten(1, (K, -1))[:, order].flatten(1, 2)
     assert_same(permuted_predicted, replace(predicted, log_heat=heat))
 
 
@@ -132,10 +135,15 @@ def test_view_without_valid_depth_is_never_chosen_and_its_colours_do_not_matter(
     assert_same(decide(net, replace(seen, depth=depth, rgb=rgb))[1], predicted)
 
 
-def test_scene_outside_of_the_workspace_gives_finite_numbers(net: HistMVNet) -> None:
+@pytest.mark.parametrize("farther", [20.0, -20.0])
+def test_a_scene_of_which_nothing_counts_is_decided_from_the_middle_of_the_workspace(
+    net: HistMVNet, farther: float
+) -> None:
+    """All pixels outside of the workspace or without depth: neither far points nor camera positions are targets."""
     seen = tiny_observation(2, K, net.semantics.text_width)
-    _, predicted, _ = decide(net, replace(seen, depth=seen.depth + 20))
-    assert predicted.position.isfinite().all()
+    _, predicted, _ = decide(net, replace(seen, depth=(seen.depth + farther).clamp_min(0)))
+    assert predicted.surface.equal(net.workspace.centre.expand(2, 3))
+    assert all(values.isfinite().all() for values in (predicted.position, predicted.quaternion, predicted.gripper))
 
 
 def walked(tools: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -20,6 +20,7 @@ from lerobot_histmv.model.rotations import matrix_of
 
 M, Y, X, WIDTH = 3, 32, 48, 8
 SKIPS = [4, 5, 5, 5]
+MIDDLE = torch.tensor([0.45, -0.1, 0.3])
 
 
 def logits_and_mask() -> tuple[Tensor, Tensor]:
@@ -93,7 +94,7 @@ def inputs(seed: int = 1) -> dict[str, Any]:
 
 def decoder(seed: int = 0) -> Decoder:
     torch.manual_seed(seed)
-    return Decoder(WIDTH, SKIPS, DecoderConfig())
+    return Decoder(WIDTH, SKIPS, DecoderConfig(), MIDDLE)
 
 
 def decode(module: Decoder, given: dict[str, Any]) -> Prediction:
@@ -184,7 +185,7 @@ def test_depth_number_moves_the_position_along_the_ray_from_the_camera() -> None
 
 @pytest.mark.parametrize("tool_frame", [True, False])
 def test_rotation_turns_with_the_tool_only_in_the_tool_s_frame(tool_frame: bool) -> None:
-    given, module = inputs(), Decoder(WIDTH, SKIPS, DecoderConfig(tool_frame=tool_frame))
+    given, module = inputs(), Decoder(WIDTH, SKIPS, DecoderConfig(tool_frame=tool_frame), MIDDLE)
     before = decode(module, given).quaternion
     given["tool"] = given["tool"].mT
     assert decode(module, given).quaternion.equal(before) != tool_frame
