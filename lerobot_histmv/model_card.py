@@ -25,6 +25,8 @@ CONVENTIONS = """* World = robot base, metres, z up. Camera frame: x right, y do
 * Calibration comes with every observation: `observation.camera_intrinsics` (fx, fy, cx, cy [pixels] of every camera)
   and `observation.camera_extrinsics` (rows of the 3 x 4 matrix from camera to world), in the cameras' order above.
 * Depth in millimetres along the optical axis, 0 = invalid.
+* `observation.state` begins with the measured tool: position [m], quaternion w, x, y, z (unit, w >= 0), opening of the
+  gripper (1 open, 0 closed). The tool is the point between the finger pads.
 * An action is the next key pose: tool position [m], quaternion w, x, y, z, gripper (1 open, 0 closed). The arm moves to
   it with the gripper as it is, then the gripper is driven, then the next observation is taken."""
 
@@ -67,7 +69,7 @@ def model_card(
     if dataset_meta is not None and keys.INTRINSICS in dataset_meta.features:
         parts.append(f"## Calibration of the training data\n\n{calibration_table(dataset_meta)}")
     success = evaluation_text.measured(evaluation, config) if evaluation else "Not told; the last command measures it."
-    parts += [f"## Conventions\n\n{CONVENTIONS}", _instructions(config), f"## Measured success\n\n{success}"]
+    parts += [_conventions(config), _instructions(config), f"## Measured success\n\n{success}"]
     parts.append(f"## Training it again\n\n{_again(training, made, place, folder)}")
     parts.append(f"## Evaluation\n\n{_evaluation(config, evaluation, place)}")
     text = "\n\n".join(parts)
@@ -81,6 +83,12 @@ def _opening(config: HistMVConfig) -> str:
         f"and calibration of the cameras {', '.join(config.cameras)} ({columns} x {rows} pixels), an instruction and "
         f"{config.network.history.memory} past steps to the next key pose of the tool."
     )
+
+
+def _conventions(config: HistMVConfig) -> str:
+    approach = tuple(config.loss.approach)
+    points = f"\n* In its own frame the tool points along ({', '.join(f'{part:g}' for part in approach)})."
+    return f"## Conventions\n\n{CONVENTIONS}{points if any(approach) else ''}"
 
 
 def _training(config: HistMVConfig, training: Any, dataset_meta: Any, linked: bool) -> str:

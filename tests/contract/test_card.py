@@ -152,6 +152,8 @@ def test_policys_card_tells_data_conventions_and_how_to_evaluate(keyed: Path) ->
         "7, batches of 3, seed 5",
         "48 x 32 pixels",
         "from camera to world",
+        "`observation.state` begins with the measured tool: position [m], quaternion w, x, y, z",
+        "In its own frame the tool points along (0, 0, -1).",
         f"* {TASK}",
         "## Calibration of the training data",
     ):
