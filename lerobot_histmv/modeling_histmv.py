@@ -209,7 +209,8 @@ class HistMVPolicy(PreTrainedPolicy):
             else:
                 outputs[row] = output
         if due:
-            seen = {key: value[due] for key, value in batch.items() if key.startswith(keys.OBS_PREFIX)}
+            rows = torch.tensor(due, device=batch[keys.STATE].device)
+            seen = {key: value[rows] for key, value in batch.items() if key.startswith(keys.OBS_PREFIX)}
             decided = self._decide(seen | {"task": [batch["task"][row] for row in due]}, past, due)
             for row, decision in zip(due, decided.double().cpu().numpy(), strict=True):
                 outputs[row] = self._held[row].begin(decision, states[row])

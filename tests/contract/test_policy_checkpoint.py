@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -147,6 +148,18 @@ def test_frozen_clip_is_not_copied_into_checkpoints(clip_file: Path, tmp_path: P
     assert (tmp_path / "model.safetensors").stat().st_size < clip_file.stat().st_size / 10
     torch.manual_seed(11)
     assert act(HistMVPolicy.from_pretrained(tmp_path)).equal(act(policy))
+
+
+def test_a_checkpoint_whose_frozen_weights_are_gone_says_which_and_what_else_is_accepted(
+    clip_file: Path, tmp_path: Path
+) -> None:
+    weights = tmp_path / "elsewhere.pt"
+    shutil.copyfile(clip_file, weights)
+    frozen = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights)))
+    tiny_policy(tiny_config(network=frozen)).save_pretrained(tmp_path / "checkpoint")
+    weights.unlink()
+    with pytest.raises(ValueError, match=rf"semantics\.clip_pretrained='{weights}'"):
+        HistMVPolicy.from_pretrained(tmp_path / "checkpoint")
 
 
 def test_trained_clip_started_from_a_file_does_belong_to_the_checkpoint(clip_file: Path, tmp_path: Path) -> None:

@@ -3,35 +3,17 @@
 from pathlib import Path
 from typing import Any
 
-import open_clip
 import pytest
 import torch
 from helpers.elsewhere import DEVICE, Elsewhere, second_device
 from helpers.gradients import assert_same_gradients
+from helpers.networks import CHOICES, networks
 from tiny_policy import episode, observation, stack, tiny_config, tiny_policy, window
-from tiny_scene import tiny_network
 
 from lerobot_histmv.chance import drawn_from
-from lerobot_histmv.model import semantics
+from lerobot_histmv.control import ControlConfig
 from lerobot_histmv.model.augment import AugmentConfig
-from lerobot_histmv.model.config import NetworkConfig, SemanticsConfig, ViewConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
-
-CHOICES = ["argmax", "sampled", "expected", "ranked"]
-"""Views decoded in training where one view decides."""
-
-
-def networks(folder: Path) -> dict[str, NetworkConfig]:
-    """Every way to fuse and to choose views, and frozen towers, which lie outside of the policy's module tree."""
-    weights = folder / "clip.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
-    return {
-        "all": tiny_network(),
-        **{choice: tiny_network(views=ViewConfig(decode="one", train_choice=choice)) for choice in CHOICES},
-        **{fusion: tiny_network(views=ViewConfig(fusion=fusion)) for fusion in ("mean", "tokens")},
-        "weight": tiny_network(views=ViewConfig(decode="one", act="weight")),
-        "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
-    }
 
 
 def moved(batch: dict[str, Any]) -> dict[str, Any]:
@@ -76,6 +58,20 @@ def test_acting_elsewhere_gives_the_same_actions(name: str, tmp_path: Path) -> N
             assert isinstance(action, Elsewhere)
             torch.testing.assert_close(action.values, expected[step])
     assert not returned
+
+
+def test_a_target_is_held_elsewhere_as_here() -> None:
+    """In a loop of 20 Hz the held target leaves the device as eight numbers per robot, and nothing else does."""
+    config, rows = tiny_config(control=ControlConfig(rate=20)), episode(1)
+    here, policy = tiny_policy(config), tiny_policy(config)
+    expected = [here.select_action(observation(rows, 0)) for _ in range(3)]
+    with second_device() as returned:
+        policy.to(DEVICE)
+        for one in expected:
+            action = policy.select_action(moved(observation(rows, 0)))
+            assert isinstance(action, Elsewhere)
+            torch.testing.assert_close(action.values, one)
+    assert all(torch.Size(shape).numel() <= 8 for shape in returned), returned
 
 
 def test_second_device_refuses_what_a_gpu_refuses() -> None:

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 import torch
 from helpers.gradients import assert_same_gradients
+from helpers.networks import networks
 from helpers.ranks import in_ranks
-from tiny_policy import episode, observation, stack, tiny_policy, window
+from tiny_policy import episode, observation, stack, tiny_config, tiny_policy, window
 
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
@@ -27,14 +28,32 @@ def actions(policy: HistMVPolicy) -> torch.Tensor:
     return torch.cat([policy.select_action(observation(rows, at)) for at in range(3)])
 
 
-def test_bfloat16_keeps_the_loss_and_the_direction_of_the_gradient() -> None:
-    expected, gradient = step(tiny_policy())
+KINDS = ["all", "mean", "tokens", "ranked", "frozen"]
+"""Networks in which rounding cannot make another view act."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bfloat16_keeps_the_loss_and_the_direction_of_the_gradient(kind: str, tmp_path: Path) -> None:
+    config = tiny_config(network=networks(tmp_path)[kind])
+    expected, gradient = step(tiny_policy(config))
     with torch.autocast("cpu", torch.bfloat16):
-        loss, found = step(tiny_policy())
+        loss, found = step(tiny_policy(config))
     assert {loss.dtype, *(one.dtype for one in found)} == {torch.float32}
     torch.testing.assert_close(loss, expected, rtol=0.02, atol=0)
     both = (torch.cat([one.flatten() for one in gradients]) for gradients in (found, gradient))
     assert 0.9 < torch.cosine_similarity(*both, dim=0) < 1 - 1e-6, "1 would mean that nothing was rounded"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bfloat16_moves_no_action_by_millimetres(kind: str, tmp_path: Path) -> None:
+    config = tiny_config(network=networks(tmp_path)[kind])
+    expected = actions(tiny_policy(config))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = actions(tiny_policy(config))
+    assert found.dtype == torch.float32
+    assert 0 < (found - expected)[:, :3].norm(dim=1).max() < 2e-3, "0 would mean that nothing was rounded"
+    torch.testing.assert_close(found[:, 3:7], expected[:, 3:7], atol=0.03, rtol=0)
+    assert found[:, 7].equal(expected[:, 7])
 
 
 def test_bfloat16_leaves_geometry_alone() -> None:

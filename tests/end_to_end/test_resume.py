@@ -1,7 +1,9 @@
 """``lerobot-train`` goes on where it was stopped, on one process and on two, and from either with the other."""
 
 import json
+import re
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 import torch
 import yaml
 from helpers.keyframed import keyframed, training
-from helpers.ranks import in_ranks, lerobot_train
+from helpers.ranks import in_ranks, lerobot_train, lerobot_train_killed
 from safetensors.torch import load_file
 
 from lerobot_histmv.configuration_histmv import HistMVConfig
@@ -47,11 +49,22 @@ def train(tmp_path_factory: pytest.TempPathFactory) -> Train:
     return run
 
 
-def resumed(straight: Path, processes: int, output: Path) -> str:
-    """Goes on from the earlier checkpoint of ``straight`` in new processes; what they log."""
+def leave_the_earlier_checkpoint_of(straight: Path, output: Path) -> None:
+    """``output`` is as the uninterrupted training's folder was before its last steps."""
     first = straight / f"checkpoints/{STOPPED:06d}"
     shutil.copytree(first, output / "checkpoints" / first.name)
     (output / "checkpoints/last").symlink_to(first.name)
+
+
+def kill_one_like(straight: Path, output: Path) -> None:
+    """``output`` is what a training of one process leaves that is killed after its first checkpoint."""
+    words = [f"--config_path={straight.parent}/train.yaml", f"--output_dir={output}"]
+    in_ranks(1, straight.parent / "killed.log", lerobot_train_killed, words, end_with=-signal.SIGKILL)
+    assert sorted(path.name for path in (output / "checkpoints").iterdir()) == [f"{STOPPED:06d}", "last"]
+
+
+def resumed(processes: int, output: Path) -> str:
+    """Goes on from the last checkpoint in ``output`` in new processes; what they log."""
     config = output / "checkpoints/last/pretrained_model/train_config.json"
     log = output / "log.txt"
     words = [f"--config_path={config}", "--resume=true", f"--output_dir={output}"]
@@ -65,14 +78,24 @@ def state(output: Path, step: int = STEPS) -> dict[str, torch.Tensor]:
     return {name: value for file in (WEIGHTS, OPTIMIZER) for name, value in load_file(folder / file).items()}
 
 
+def losses(log: str) -> list[str]:
+    """The logged losses of the steps after the stop."""
+    curve = dict(re.findall(r"step:(\d+) .* loss:(\S+)", log))
+    return [curve[str(step)] for step in range(STOPPED + 1, STEPS + 1)]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize(
+    ("processes", "stop"), [(1, kill_one_like), (2, leave_the_earlier_checkpoint_of)], ids=["killed", "two processes"]
+)
 def test_resumed_training_ends_bit_for_bit_as_one_without_interruption(
-    train: Train, processes: int, tmp_path: Path
+    train: Train, processes: int, stop: Callable[[Path, Path], None], tmp_path: Path
 ) -> None:
-    straight = train(processes)
-    resumed(straight, processes, tmp_path)
-    expected, found = state(straight), state(tmp_path)
+    straight, output = train(processes), tmp_path / "stopped"
+    stop(straight, output)
+    log = resumed(processes, output)
+    assert losses(log) == losses(straight.with_suffix(".log").read_text())
+    expected, found = state(straight), state(output)
     assert expected.keys() == found.keys()
     assert [name for name, value in expected.items() if not value.equal(found[name])] == []
 
@@ -82,7 +105,8 @@ def test_resumed_training_ends_bit_for_bit_as_one_without_interruption(
 def test_checkpoints_load_on_another_number_of_processes(train: Train, before: int, after: int, tmp_path: Path) -> None:
     """What a checkpoint holds bounds what few more steps of Adam can make of it, whatever rows they see."""
     straight = train(before)
-    said = resumed(straight, after, tmp_path)
+    leave_the_earlier_checkpoint_of(straight, tmp_path)
+    said = resumed(after, tmp_path)
     assert f"Effective batch size: 2 x {after} = {2 * after}" in said
     stored, found = state(straight, STOPPED), state(tmp_path)
     assert found.keys() == stored.keys()

@@ -4,6 +4,7 @@ import faulthandler
 import logging
 import multiprocessing
 import os
+import signal
 import socket
 import sys
 import time
@@ -19,11 +20,11 @@ PATIENCE = 240.0
 """How long [s] the processes may take."""
 
 
-def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: Any) -> None:
+def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: Any, end_with: int = 0) -> None:
     """``function(rank, *arguments)`` in ``count`` processes that find each other as torchrun's would.
 
-    ``log`` gets what they print. AssertionError with that, if one fails, or after ``PATIENCE``: a rank whose neighbour
-    has failed waits for it.
+    ``log`` gets what they print. AssertionError with that, if one ends with another exit code than ``end_with``, or
+    after ``PATIENCE``: a rank whose neighbour has failed waits for it.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
@@ -42,7 +43,7 @@ def in_ranks(count: int, log: Path, function: Callable[..., None], *arguments: A
     for process in late:
         process.kill()
         process.join()
-    assert all(process.exitcode == 0 for process in processes), f"{len(late)} did not end:\n{log.read_text()}"
+    assert all(process.exitcode == end_with for process in processes), f"{len(late)} did not end:\n{log.read_text()}"
 
 
 def _run(rank: int, count: int, port: int, log: Path, function: Callable[..., None], arguments: Sequence[Any]) -> None:
@@ -73,3 +74,17 @@ def lerobot_train(_: int, words: Sequence[str]) -> None:
 
     sys.argv = ["lerobot-train", *words]
     main()
+
+
+def lerobot_train_killed(rank: int, words: Sequence[str]) -> None:
+    """The same, killed as soon as its first checkpoint is complete."""
+    from lerobot.scripts import lerobot_train as script
+
+    complete = script.update_last_checkpoint
+
+    def complete_and_die(checkpoint: Path) -> None:
+        complete(checkpoint)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    script.update_last_checkpoint = complete_and_die
+    lerobot_train(rank, words)

@@ -82,6 +82,41 @@ def test_surface_that_the_key_pose_points_at_comes_first(approach: tuple[float, 
     torch.testing.assert_close(heat_loss(log_heat, others, target, approach), heat_loss(log_heat, others, target))
 
 
+@pytest.mark.parametrize("approach", [(0.0, 0.0, 0.0), (0.6, 0.8, 0.0)])
+def test_heat_loss_is_the_cross_entropy_to_a_gaussian_of_15_mm_on_the_surface_value_and_gradient(
+    approach: tuple[float, float, float],
+) -> None:
+    """Pixel by pixel, in double precision and plain words; a third of the pixels is invalid."""
+    log_heat, cloud, target = random_case()
+    invalid = torch.rand(M, Y, X, generator=torch.Generator().manual_seed(3)) < 1 / 3
+    log_heat = log_heat.masked_fill(invalid, -torch.inf).requires_grad_()
+    found = heat_loss(log_heat, cloud, target, approach)
+    (gradient,) = torch.autograd.grad(found.sum(), log_heat)
+    for m in range(M):
+        axis = Rotation.from_quat(target[m, 3:].double().numpy(), scalar_first=True).apply(approach)
+        way = {
+            (y, x): (cloud[m, :, y, x] - target[m, :3]).double().numpy()
+            for y in range(Y)
+            for x in range(X)
+            if not invalid[m, y, x]
+        }
+        ahead = {pixel: float(one @ axis) for pixel, one in way.items()}
+        pointed = {
+            pixel: one
+            for pixel, one in way.items()
+            if any(approach) and ahead[pixel] > -BEHIND and one @ one - ahead[pixel] ** 2 < AXIS_REACH**2
+        }
+        chosen = pointed or way
+        density = {pixel: math.exp(-0.5 * (one @ one) / 0.015**2) for pixel, one in chosen.items()}
+        total = sum(density.values())
+        expected = -sum(share / total * log_heat[m, *pixel].item() for pixel, share in density.items())
+        assert found[m].item() == pytest.approx(expected, rel=1e-4)
+        for y in range(Y):
+            for x in range(X):
+                wanted = -density.get((y, x), 0.0) / total
+                assert gradient[m, y, x].item() == pytest.approx(wanted, rel=1e-3, abs=1e-6)
+
+
 def test_a_pose_over_an_object_wants_heat_on_the_object_and_not_on_the_gripper_beside_and_above_it() -> None:
     """Over pixel (2, 3) and pointing down; the last two pixels, of a gripper, are nearer, aside and behind."""
     uniform, cloud, target = heat_case()

@@ -85,6 +85,18 @@ def test_redundancy_teaches_features_where_asked(form: str) -> None:
     assert maps.grad.abs().sum() > 0
 
 
+@pytest.mark.parametrize("form", ["nmi", "text", "literal"])
+def test_redundancy_of_maps_that_tell_nothing_has_finite_gradients(form: str) -> None:
+    """Constant maps share nothing, equal ones all there is: the ends of the normalised form's root and logarithm."""
+    _, text, present = inputs()
+    for maps in (torch.full((N, K, D, H, W), 5.0), torch.randn(N, 1, D, H, W).expand(N, K, D, H, W)):
+        module, maps = attention(mi_loss=form, mi_gradient=True), maps.clone().requires_grad_()
+        redundancy = module.redundancy(maps, module(maps.detach(), text, present))
+        redundancy.sum().backward()
+        assert redundancy.isfinite().all()
+        assert maps.grad is not None and maps.grad.isfinite().all()
+
+
 @pytest.mark.parametrize(("form", "sign"), [("text", 1), ("literal", -1)])
 def test_equation_6_sums_information_in_nats(form: str, sign: int) -> None:
     """Gaussian views of correlation rho share I = -d/2 ln(1 - rho^2) (d = 3); one that shares nothing adds nothing."""

@@ -1,0 +1,26 @@
+"""Tiny networks of every kind that the configuration knows."""
+
+from pathlib import Path
+
+import open_clip
+import torch
+from tiny_scene import tiny_network
+
+from lerobot_histmv.model import semantics
+from lerobot_histmv.model.config import NetworkConfig, SemanticsConfig, ViewConfig
+
+CHOICES = ["argmax", "sampled", "expected", "ranked"]
+"""Views decoded in training where one view decides."""
+
+
+def networks(folder: Path) -> dict[str, NetworkConfig]:
+    """Every way to fuse and to choose views, and frozen towers, which lie outside of the policy's module tree."""
+    weights = folder / "clip.pt"
+    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
+    return {
+        "all": tiny_network(),
+        **{choice: tiny_network(views=ViewConfig(decode="one", train_choice=choice)) for choice in CHOICES},
+        **{fusion: tiny_network(views=ViewConfig(fusion=fusion)) for fusion in ("mean", "tokens")},
+        "weight": tiny_network(views=ViewConfig(decode="one", act="weight")),
+        "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
+    }
