@@ -29,12 +29,13 @@ def farthest_points(points: Float[Tensor, "n p 3"], valid: Bool[Tensor, "n p"], 
 
     Starts at the first valid point. When fewer valid points than ``count`` exist, points repeat.
     """
+    batch = torch.arange(len(points), device=points.device)
     nearest = torch.where(valid, torch.inf, -1.0)
     chosen = valid.float().argmax(dim=1)
     picks = []
     for _ in range(count):
         picks.append(chosen)
-        distances = exact_distances(gather_points(points, chosen[:, None]), points)
+        distances = exact_distances(points[batch, chosen, None], points)
         nearest = torch.minimum(nearest, distances[:, 0])
         chosen = nearest.argmax(dim=1)
     return torch.stack(picks, dim=1)
