@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,8 +18,8 @@ from lerobot_histmv.chance import drawn_from
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.control import HeldStep
 from lerobot_histmv.data.instructions import load_paraphrases, meanings
+from lerobot_histmv.decision import Decision
 from lerobot_histmv.model import augment, losses
-from lerobot_histmv.model.decoder import Prediction
 from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.model.layers import full_precision, masked_mean
 from lerobot_histmv.model.network import Encoding, HistMVNet
@@ -33,33 +33,6 @@ MEANINGS = 12
 """Instructions that one training step tells apart."""
 FUSED = ("cpu", "cuda")
 """Devices for which torch has fused optimizers."""
-
-
-@dataclass
-class Decision:
-    """What the last decision of a batch of environments looked like, for pictures.
-
-    Args:
-        weights: view weights.
-        view: index of the chosen view.
-        heat: heat map over the chosen view's pixels, sums to 1; to the view's share with decode="all", where the view
-            chosen is the one with most of the heat.
-        surface: expectation of the heat map over the cloud, before the offset [m].
-    """
-
-    weights: Float[Tensor, "b k"]
-    view: Int[Tensor, " b"]
-    heat: Float[Tensor, "b y x"]
-    surface: Float[Tensor, "b 3"]
-
-    def updated(self, rows: Sequence[int], newer: "Decision") -> "Decision":
-        """This one with the environments ``rows`` replaced by ``newer``, in their order."""
-        return Decision(
-            **{
-                name: old.index_copy(0, torch.tensor(rows, device=old.device), getattr(newer, name))
-                for name, old in ((field.name, getattr(self, field.name)) for field in fields(self))
-            }
-        )
 
 
 class HistMVPolicy(PreTrainedPolicy):
@@ -122,6 +95,7 @@ class HistMVPolicy(PreTrainedPolicy):
         """Forget all past steps and held targets; call it whenever the environments are reset."""
         self._past: Past | None = None
         self._held: list[HeldStep] = []
+        self._heard: dict[str, Tensor] = {}
         self.last_decision: Decision | None = None
 
     def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
@@ -219,14 +193,14 @@ class HistMVPolicy(PreTrainedPolicy):
     def _decide(self, batch: Batch, past: Past, rows: Sequence[int]) -> Float[Tensor, "n 8"]:
         """Key poses of the environments ``rows``, whose observations alone are in the batch."""
         window = read_window(batch, self.config.cameras)
-        text = self.net.semantics.text(self._known(batch["task"]), window.tool.device)
+        text = self._hear(batch["task"], window.tool.device)
         tool, heat = past.add_tools(rows, window.tool[:, -1])
         encoding = self.net.encode(replace(window, tool=tool, heat=heat).observe(text))
         fused, real = past.add_maps(rows, encoding.fused)
         count = real.sum(dim=1)
         enriched = self.net.remember(fused, text.repeat_interleave(count, dim=0), Lookback.over(real).newest())
         predicted, views = self.net.decode_best(encoding, enriched)
-        decision = self._decision(encoding, predicted, views[:, 1])
+        decision = Decision.of(encoding, predicted, views[:, 1])
         self.last_decision = self.last_decision.updated(rows, decision) if self.last_decision else decision
         return self._action(predicted.position, predicted.quaternion, predicted.gripper)
 
@@ -252,13 +226,6 @@ class HistMVPolicy(PreTrainedPolicy):
         if not corners:
             return workspace.low, workspace.high
         return workspace.low.new_tensor(corners[:3]), workspace.high.new_tensor(corners[3:])
-
-    @staticmethod
-    def _decision(encoding: Encoding, predicted: Prediction, view: Int[Tensor, " b"]) -> Decision:
-        rows = torch.arange(len(view), device=view.device)
-        heat = rearrange(predicted.log_heat.exp(), "b (k y) x -> b k y x", y=encoding.cloud.shape[-2])
-        own = heat[rows, view.clamp_max(heat.shape[1] - 1)]  # one view's heat map stands alone, whichever it is
-        return Decision(encoding.weights, view, own, predicted.surface)
 
     def _choice_loss(
         self, encoding: Encoding, text: Float[Tensor, "n c"], view: Int[Tensor, " m"], losses: Float[Tensor, " m"]
@@ -287,10 +254,15 @@ class HistMVPolicy(PreTrainedPolicy):
         owners = torch.tensor([i for i, pair in zip(picked, pairs, strict=True) for _ in pair], device=device)
         return losses.paraphrase_loss(self.net.semantics.text(sentences, device), owners)
 
-    def _known(self, sentences: list[str]) -> list[str]:
-        """The sentences, with one warning for each that training never saw: it is encoded like any other."""
+    def _hear(self, sentences: list[str], device: torch.device) -> Float[Tensor, "n c"]:
+        """Instruction vectors, encoded once until ``reset`` also by a trained tower.
+
+        One that training never saw is encoded like any other, with one warning.
+        """
         known = {sentence for options in self.config.instructions.values() for sentence in options}
         for sentence in set(sentences) - known - self._warned:
             logging.warning("instruction %r was not in the training data; the action relies on similar ones", sentence)
             self._warned.add(sentence)
-        return sentences
+        if fresh := [sentence for sentence in sentences if sentence not in self._heard]:
+            self._heard.update(zip(fresh, self.net.semantics.text(fresh, device), strict=True))
+        return torch.stack([self._heard[sentence] for sentence in sentences])

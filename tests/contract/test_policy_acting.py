@@ -137,6 +137,24 @@ def test_reset_forgets_everything(policy: HistMVPolicy) -> None:
     assert policy.last_decision is None
 
 
+def test_an_instruction_is_encoded_once_until_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also by a trained text tower, whose weights change between two evaluations during a training."""
+    policy = tiny_policy(tiny_config(past_steps=LONG - 1))
+    rows, tower = episode(3), policy.net.semantics._text_tower[0]
+    heard: list[list[str]] = []
+    encode = tower.text
+    monkeypatch.setattr(tower, "text", lambda sentences: heard.append(sentences) or encode(sentences))
+    first = act(policy, rows, 3)
+    assert heard == [[TASK]]
+    policy.select_action(observation(rows, 2, "press the green button"))
+    assert heard == [[TASK], ["press the green button"]]
+    with torch.no_grad():
+        for parameter in tower.parameters():
+            parameter.mul_(1.5)
+    assert not torch.allclose(act(policy, rows, 3), first, atol=1e-6)
+    assert heard[2:] == [[TASK]]
+
+
 def test_history_changes_the_third_decision(policy: HistMVPolicy) -> None:
     rows = episode(3)
     after_two = act(policy, rows, 3)[-1]
@@ -229,7 +247,8 @@ def test_a_decision_late_in_a_long_episode_costs_what_the_first_with_full_memory
             policy.select_action(observation(rows, step))
         operations.append(counter.get_total_flops())
         remembered.append(remembered_bytes(policy))
-    assert 0 < operations[0] < operations[LONG - 1], "what is remembered costs something"
+    assert operations[0] > operations[1], "the first also encodes the instruction"
+    assert 0 < operations[1] < operations[LONG - 1], "what is remembered costs something"
     assert 0 < remembered[0] < remembered[LONG - 1]
     assert set(operations[LONG - 1 :]) == {operations[LONG - 1]}
     assert set(remembered[LONG - 1 :]) == {remembered[LONG - 1]}
