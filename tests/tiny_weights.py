@@ -43,6 +43,12 @@ def r3m_checkpoint(convnet: nn.Module) -> dict[str, Any]:
     return {"r3m": weights | language, "global_step": 7}
 
 
+def r3m_file(path: Path, depth: int = 18) -> Path:
+    """A seeded R3M checkpoint."""
+    torch.save(r3m_checkpoint(resnet(depth)), path)
+    return path
+
+
 class TouchWhenUnpickled:
     """Stands for any code in a pickle: unpickling creates a file."""
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from fake_ur5 import INSTRUCTION, FakeUR5Config, write_checkpoint
 from helpers import episodes
+from matplotlib.axes import Axes
 from PIL import Image
 from tiny_dataset import write_dataset
 from tiny_policy import TASK, episode, observation, tiny_config, tiny_policy, window
@@ -24,10 +25,13 @@ from dataset_tools.explain.board import LARGEST, LINE, draw_board
 from dataset_tools.explain.chapter import PANELS, facts, notes
 from dataset_tools.explain.command import PAGE, ExplainConfig, ExplainedDataset, run
 from dataset_tools.explain.episode import Explained
+from dataset_tools.explain.step_panels import draw_history, draw_poses
+from dataset_tools.explain.view_panels import draw_information, draw_weights
 from dataset_tools.explain.watch import Record, watched
+from dataset_tools.page import draw_panels
 from lerobot_histmv import keys
 from lerobot_histmv.geometry import project
-from lerobot_histmv.model.config import ViewConfig
+from lerobot_histmv.model.config import HistoryConfig, ViewConfig
 from lerobot_histmv.model.history import Lookback
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 from lerobot_histmv.windows import read_window
@@ -226,6 +230,40 @@ def test_errors_are_measured_and_a_better_view_is_named(acted: tuple[torch.Tenso
     (note,) = notes(told)
     assert note.startswith("decision 4: ")
     assert note.endswith("alone would have been 0 cm off")
+
+
+def test_panels_draw_the_numbers_of_the_records(acted: tuple[torch.Tensor, list[Record]]) -> None:
+    told = Explained("episode 0", TASK, acted[1], acted[0].numpy() + 0.1)
+    *_, weights, scores = draw_weights(told).findobj(Axes)
+    for axes, values in ((weights, told.weights), (scores, told.scores)):
+        lines = [line.get_ydata() for line in axes.lines if line.get_linestyle() == "-"]
+        np.testing.assert_allclose(np.stack(lines, axis=1), values)
+        assert sum(line.get_linestyle() == ":" for line in axes.lines) == len(told.changes)
+    *layers, moved = draw_history(told).findobj(Axes)
+    for layer, axes in enumerate(layers):
+        drawn = np.ma.filled(axes.images[0].get_array(), np.nan) / 100
+        np.testing.assert_allclose(drawn[-1], acted[1][-1].attention[layer], atol=1e-6)
+        assert np.isnan(drawn[0, 1:]).all(), "no step looks ahead"
+    np.testing.assert_allclose(moved.images[0].get_array()[-1, : STEPS - 1] / 100, acted[1][-1].influence, atol=1e-6)
+    mean, *each = [axes.images[0].get_array() for axes in draw_information(told).findobj(Axes) if axes.texts]
+    np.testing.assert_allclose(mean, told.information.mean(axis=0))
+    np.testing.assert_allclose(each, told.information)
+    positions, errors = draw_poses(told).findobj(Axes)
+    predicted = [line.get_ydata() for line in positions.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(np.stack(predicted, axis=1), told.actions[:, :3])
+    heights = [bar.get_height() for bar in errors.patches]
+    np.testing.assert_allclose(heights, 1000 * told.errors, atol=1e-3)
+
+
+def test_without_history_its_panel_is_left_out(tmp_path: Path) -> None:
+    policy = tiny_policy(tiny_config(network=tiny_network(history=HistoryConfig(enabled=False, layers=2, heads=2))))
+    policy.reset()
+    with watched(policy) as records:
+        for step in range(3):
+            policy.select_action(observation(episode(3), step))
+    assert all(record.memory == 0 and len(record.influence) == 0 for record in records)
+    exhibits = draw_panels(PANELS, Explained("episode 0", TASK, records), tmp_path, "episode")
+    assert {one.path.name for one in exhibits} == {"episode_views.png", "episode_poses.png", "episode_information.png"}
 
 
 @pytest.mark.parametrize(

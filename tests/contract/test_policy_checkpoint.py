@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,8 +9,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import open_clip
 import pytest
+import tiny_weights
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
@@ -21,7 +20,6 @@ from tiny_scene import tiny_network
 
 from lerobot_histmv import keys
 from lerobot_histmv.configuration_histmv import HistMVConfig
-from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import HistoryConfig, NetworkConfig, SemanticsConfig, TextureConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
@@ -132,38 +130,45 @@ def test_loaded_processors_check_the_same_cameras(saved: tuple[HistMVPolicy, Pat
         before(batch)
 
 
-@pytest.fixture(scope="module")
-def clip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of a tiny CLIP in open_clip's format."""
-    torch.manual_seed(3)
-    path = tmp_path_factory.mktemp("clip") / "tiny.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), path)
-    return path
+FROZEN = {
+    "clip": lambda path: SemanticsConfig(clip_pretrained=str(tiny_weights.clip_file(path))),
+    "r3m": lambda path: SemanticsConfig(image="r3m", r3m_pretrained=str(tiny_weights.r3m_file(path))),
+}
+"""Image towers that are never trained, with weights in a file."""
 
 
-def test_frozen_clip_is_not_copied_into_checkpoints(clip_file: Path, tmp_path: Path) -> None:
-    frozen = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(clip_file)))
-    policy = tiny_policy(tiny_config(network=frozen))
+@pytest.fixture(scope="module", params=FROZEN)
+def frozen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NetworkConfig]:
+    """A file of weights, and a network with the tower that takes them."""
+    path = tmp_path_factory.mktemp("weights") / "tower.pt"
+    return path, tiny_network(semantics=FROZEN[request.param](path))
+
+
+def test_a_frozen_tower_is_not_copied_into_checkpoints(frozen: tuple[Path, NetworkConfig], tmp_path: Path) -> None:
+    path, network = frozen
+    policy = tiny_policy(tiny_config(network=network))
     policy.save_pretrained(tmp_path)
-    assert (tmp_path / "model.safetensors").stat().st_size < clip_file.stat().st_size / 10
+    assert (tmp_path / "model.safetensors").stat().st_size < path.stat().st_size / 2
     torch.manual_seed(11)
     assert act(HistMVPolicy.from_pretrained(tmp_path)).equal(act(policy))
 
 
 def test_a_checkpoint_whose_frozen_weights_are_gone_says_which_and_what_else_is_accepted(
-    clip_file: Path, tmp_path: Path
+    frozen: tuple[Path, NetworkConfig], tmp_path: Path
 ) -> None:
-    weights = tmp_path / "elsewhere.pt"
-    shutil.copyfile(clip_file, weights)
-    frozen = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights)))
-    tiny_policy(tiny_config(network=frozen)).save_pretrained(tmp_path / "checkpoint")
-    weights.unlink()
-    with pytest.raises(ValueError, match=rf"semantics\.clip_pretrained='{weights}'"):
-        HistMVPolicy.from_pretrained(tmp_path / "checkpoint")
+    path, network = frozen
+    tiny_policy(tiny_config(network=network)).save_pretrained(tmp_path / "checkpoint")
+    path.rename(tmp_path / "elsewhere.pt")
+    try:
+        with pytest.raises(ValueError, match=rf"semantics\.(clip|r3m)_pretrained='{path}'"):
+            HistMVPolicy.from_pretrained(tmp_path / "checkpoint")
+    finally:
+        (tmp_path / "elsewhere.pt").rename(path)
 
 
-def test_trained_clip_started_from_a_file_does_belong_to_the_checkpoint(clip_file: Path, tmp_path: Path) -> None:
-    trained = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(clip_file), train_clip=True))
+def test_trained_clip_started_from_a_file_does_belong_to_the_checkpoint(tmp_path: Path) -> None:
+    file = tiny_weights.clip_file(tmp_path / "clip.pt")
+    trained = tiny_network(semantics=SemanticsConfig(clip_pretrained=str(file), train_clip=True))
     policy = tiny_policy(tiny_config(network=trained))
     with torch.no_grad():
         for parameter in policy.get_optim_params()[0]["params"]:
