@@ -4,8 +4,8 @@
 
 Writes ``benchmarks/results/decision_speed.json``, one entry per vector instructions of the processor, for the default
 network with the tiny CLIP and with a frozen ViT-B/32 in both precisions (random weights: only time matters). Wall-clock
-figures mean something only on an idle machine, so the load and the processor time are recorded beside them. ``--profile`` prints
-instead how much each part of the tiny network takes.
+figures mean something only on an idle machine, so the load and the processor time are recorded beside them.
+``--profile`` prints instead how much each part of the tiny network takes.
 """
 
 import argparse
