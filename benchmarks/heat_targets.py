@@ -36,7 +36,9 @@ MOVED = 0.01
 def offset(cloud: Tensor, valid: Tensor, pose: Tensor, approach: tuple[float, ...]) -> Tensor:
     """Key pose minus the expectation of the heat map's target [m], which is the loss's gradient; NaN without one."""
     log_heat = torch.zeros(valid.shape).masked_fill(~valid, -torch.inf).flatten(1).log_softmax(dim=1).view(valid.shape)
-    (gradient,) = torch.autograd.grad(heat_loss(log_heat.requires_grad_(), cloud, pose, approach).sum(), log_heat)
+    (gradient,) = torch.autograd.grad(
+        heat_loss(log_heat.requires_grad_(), cloud, valid, pose, approach).sum(), log_heat
+    )
     if not gradient.any():
         return torch.full((3,), torch.nan)
     return pose[0, :3] + einsum(gradient, cloud, "m y x, m c y x -> c")

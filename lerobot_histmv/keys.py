@@ -15,6 +15,8 @@ STATE = "observation.state"
 ACTION = "action"
 INTRINSICS = "observation.camera_intrinsics"
 EXTRINSICS = "observation.camera_extrinsics"
+FROM_ROBOT = "observation.from_robot"
+"""In observations of a robot's loop, which asks for an action at every tick: its calibration was in the state."""
 ROW = "index"
 """Number of a row in its dataset, as LeRobot names it."""
 

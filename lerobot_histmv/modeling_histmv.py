@@ -124,7 +124,7 @@ class HistMVPolicy(PreTrainedPolicy):
 
         step, view = views.unbind(-1)
         target, text = window.target[lookback.decided], seen.text[lookback.decided]
-        terms = losses.action_losses(predicted, target[step], self.net.heat_cloud(encoding, views), config.loss)
+        terms = losses.action_losses(predicted, target[step], *self.net.heat_cloud(encoding, views), config.loss)
         # Views are judged by their actions alone: one that shows nothing near the target has no heat map loss at all.
         acted = losses.weighted_sum({name: term for name, term in terms.items() if name != "heatmap"}, config.loss)
         if choice == "ranked":
@@ -141,13 +141,14 @@ class HistMVPolicy(PreTrainedPolicy):
             terms["paraphrase"] = nothing + self._paraphrase_loss(nothing.device)
         per_step = losses.weighted_sum(terms, config.loss)
 
-        log = {name: masked_mean(term, rows).item() for name, term in terms.items()}
+        log = {name: masked_mean(term, rows) for name, term in terms.items()}
         error = (predicted.position - target[step, :3]).norm(dim=-1)
-        log["position_mm"] = 1e3 * masked_mean(error.detach(), rows[step] * shares.detach()).item()
-        log |= {f"view_{name}": w.item() for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
+        log["position_mm"] = 1e3 * masked_mean(error, rows[step] * shares)
+        log |= {f"view_{name}": w for name, w in zip(config.cameras, encoding.weights.mean(dim=0), strict=True)}
         owner = window.real.nonzero()[lookback.decided, 0]
         each = torch.zeros(len(window.real), device=per_step.device).index_add(0, owner, per_step * rows)
-        return each if reduction == "none" else each.mean(), log
+        numbers = torch.stack(list(log.values())).tolist()  # at once: a device is waited for once
+        return each if reduction == "none" else each.mean(), dict(zip(log, numbers, strict=True))
 
     @torch.no_grad()
     def select_action(self, batch: Batch, **_: Any) -> Float[Tensor, "b 8"]:
@@ -157,7 +158,8 @@ class HistMVPolicy(PreTrainedPolicy):
         there; an environment decides anew, and remembers what it sees, only when its macro step is over.
 
         Raises:
-            ValueError: an input or the action is not finite, or the number of environments changed without ``reset``.
+            ValueError: an input or the action is not finite, the number of environments changed without ``reset``, or
+                the observation is that of a robot and ``config.control.rate`` is 0.
         """
         states = batch[keys.STATE]
         if self._past is None:
@@ -165,6 +167,11 @@ class HistMVPolicy(PreTrainedPolicy):
         if len(self._past) != len(states):
             raise ValueError(f"{len(states)} environments, but the memory holds {len(self._past)}: call reset() first")
         if not self.config.control.rate:
+            if keys.FROM_ROBOT in batch:
+                raise ValueError(
+                    "a robot's loop asks for an action, but policy.control.rate is 0: each call would answer with the "
+                    "end of a macro step, however far away. Give --policy.control.rate=20 and the loop's rate, --fps=20"
+                )
             return self._decide(batch, self._past, range(len(states)))
         return self._hold(batch, self._past)
 

@@ -110,7 +110,8 @@ class CheckInputStep(ProcessorStep):
 def separate_calibration(observation: dict[str, Any], cameras: int) -> dict[str, Any]:
     """The observation with the calibration taken out of the state's end, where a ``Robot`` has to put it.
 
-    See ``keys.calibration_state_names``. An observation that has the calibration already, or too short a state, stays.
+    See ``keys.calibration_state_names``; ``keys.FROM_ROBOT`` then says so. An observation that has the calibration
+    already, or too short a state, stays.
     """
     if keys.STATE not in observation or keys.INTRINSICS in observation:
         return observation
@@ -119,7 +120,8 @@ def separate_calibration(observation: dict[str, Any], cameras: int) -> dict[str,
     if rest < len(keys.POSE_NAMES):
         return observation
     parts = state.split([rest, 4 * cameras, 12 * cameras], dim=-1)
-    return observation | dict(zip((keys.STATE, keys.INTRINSICS, keys.EXTRINSICS), parts, strict=True))
+    told = {keys.FROM_ROBOT: torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)}
+    return observation | told | dict(zip((keys.STATE, keys.INTRINSICS, keys.EXTRINSICS), parts, strict=True))
 
 
 def check_finite(key: str, values: Tensor) -> None:

@@ -1,5 +1,6 @@
 """The two sources of an episode: rows of a keyframed dataset, or a rollout in an environment."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,11 +43,12 @@ def open_keyframes(config: HistMVConfig, repo_id: str, root: Path | None, episod
     return source
 
 
-def explain_dataset(config: PreTrainedConfig, source: Source, film_path: Path) -> Explained:
+def explain_dataset(config: HistMVConfig, source: Source, film_path: Path) -> Explained:
     """Let the policy decide at every row of an episode, each time after the demonstration's own past."""
     (number,) = source.episodes
     rows = LeRobotDataset(source.meta.repo_id, root=source.root, episodes=[number])
-    actor = Actor.load(config)
+    deciding = replace(config, control=replace(config.control, rate=0))  # each row is a macro step
+    actor = Actor.load(deciding)
     actor.policy.reset()
     truth = []
     with watched(actor.policy) as records:

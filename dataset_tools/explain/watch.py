@@ -5,7 +5,7 @@ The policy runs as it always does. What goes into its modules and comes out is n
 from that.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +24,7 @@ from lerobot_histmv.model.layers import full_precision
 from lerobot_histmv.model.network import Encoding, HistMVNet
 from lerobot_histmv.model.view_attention import choose_views, normalised_mutual_information
 from lerobot_histmv.modeling_histmv import HistMVPolicy
+from lerobot_histmv.past import Past
 from lerobot_histmv.windows import read_window
 
 
@@ -104,9 +105,12 @@ class Notes:
 
 @contextmanager
 def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
-    """A list to which every ``select_action`` adds its record while this lasts; batches must hold one environment."""
+    """A list to which every decision adds its record while this lasts; batches must hold one environment.
+
+    With ``control.rate`` above 0 most calls of ``select_action`` decide nothing.
+    """
     net, records, notes = policy.net, list[Record](), Notes()
-    act: Callable[..., Float[Tensor, "1 8"]] = policy.select_action
+    decide = policy._decide
     decode_best = net.decode_best
 
     def note_history(_: Any, inputs: tuple[Any, ...], __: Any) -> None:
@@ -132,17 +136,17 @@ def watched(policy: HistMVPolicy) -> Iterator[list[Record]]:
             for handle in handles:
                 handle.remove()
 
-    def select_action(batch: dict[str, Any], **options: Any) -> Float[Tensor, "1 8"]:
+    def decide_and_note(batch: dict[str, Any], past: Past, rows: Sequence[int]) -> Float[Tensor, "1 8"]:
         with noted():
-            action = act(batch, **options)
+            action = decide(batch, past, rows)
         records.append(record(policy, batch, action, notes))
         return action
 
-    policy.select_action = select_action  # type: ignore[method-assign]
+    policy._decide = decide_and_note  # type: ignore[method-assign]
     try:
         yield records
     finally:
-        del policy.select_action
+        del policy._decide
 
 
 @torch.no_grad()
@@ -156,7 +160,7 @@ def record(policy: HistMVPolicy, batch: dict[str, Any], action: Float[Tensor, "1
     if views.decode == "all":
         together = notes.outcome[0].log_heat.exp()
         if net.config.decoder.peak:
-            together, _ = around_peak(together, net.heat_cloud(encoding, notes.outcome[1]))
+            together, _ = around_peak(together, net.heat_cloud(encoding, notes.outcome[1])[0])
         support = together.view_as(alone.log_heat).sum(dim=(-2, -1))
     scores = {"weight": weights[0], "weight x certainty": weights[0] * support}.get(choosing.score, support)
     with full_precision(encoding.maps):

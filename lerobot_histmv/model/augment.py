@@ -108,9 +108,9 @@ def noisy_depth(depth: Float[Tensor, "n k y x"], strength: float) -> Float[Tenso
 
 
 def draw_views(count: int, views: int, probability: float) -> Bool[Tensor, "b k"]:
-    """One view of each window with ``probability``, else none."""
+    """One view of each window with ``probability``, else none; an only view is never lost."""
     which = functional.one_hot(torch.randint(views, (count,)), views).bool()
-    return which & (torch.rand(count, 1) < probability)
+    return which & (torch.rand(count, 1) < (probability if views > 1 else 0))
 
 
 CARD_SIDE = 0.3

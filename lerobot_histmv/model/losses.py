@@ -32,6 +32,7 @@ def quaternion_loss(predicted: Float[Tensor, "m 4"], target: Float[Tensor, "m 4"
 def heat_loss(
     log_heat: Float[Tensor, "m y x"],
     cloud: Float[Tensor, "m 3 y x"],
+    valid: Bool[Tensor, "m y x"],
     target: Float[Tensor, "m 7"],
     approach: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Float[Tensor, " m"]:
@@ -43,11 +44,11 @@ def heat_loss(
     Args:
         log_heat: log-probabilities of the pixels.
         cloud: their world coordinates [m].
+        valid: which of them count: where none does, the heat map is uniform and says nothing.
         target: position [m] and quaternion wxyz of the key pose.
         approach: unit vector in which the tool points, in its own frame; zeros take the nearest surface.
     """
-    seen = log_heat > -torch.inf
-    distance = squared_distances(cloud, target[:, :3]).masked_fill_(~seen, torch.inf)
+    distance = squared_distances(cloud, target[:, :3]).masked_fill_(~valid, torch.inf)
     if any(approach):
         pointed = distance.masked_fill(~pointed_at(distance, cloud, target, approach), torch.inf)
         found = pointed.amin(dim=(1, 2), keepdim=True) < HEAT_REACH**2
@@ -55,7 +56,7 @@ def heat_loss(
     distance = distance.flatten(1)
     near = distance.amin(dim=1) < HEAT_REACH**2
     wanted = (-0.5 * distance[near] / HEAT_SIGMA**2).softmax(dim=1)
-    log_seen = log_heat.masked_fill(~seen, 0).flatten(1)[near]
+    log_seen = log_heat.masked_fill(~valid, 0).flatten(1)[near]
     return torch.zeros_like(log_heat[:, 0, 0]).masked_scatter(near, -(wanted * log_seen).sum(dim=1))
 
 
@@ -94,14 +95,19 @@ def paraphrase_loss(vectors: Float[Tensor, "n c"], meanings: Int[Tensor, " n"]) 
 
 
 def action_losses(
-    predicted: Prediction, target: Float[Tensor, "m 8"], cloud: Float[Tensor, "m 3 y x"], config: LossConfig
+    predicted: Prediction,
+    target: Float[Tensor, "m 8"],
+    cloud: Float[Tensor, "m 3 y x"],
+    valid: Bool[Tensor, "m y x"],
+    config: LossConfig,
 ) -> dict[str, Float[Tensor, " m"]]:
     """Position, rotation, gripper and heat map term of every decoded (step, view) pair, unweighted.
 
     Args:
         predicted: decoded actions.
         target: position [m], quaternion wxyz, gripper in {0, 1}.
-        cloud: world coordinates of the decoded view [m].
+        cloud: world coordinates of the decoded pixels [m].
+        valid: which of them count.
         config: forms and weights.
     """
     error = (predicted.position - target[:, :3]) / config.position_unit
@@ -115,7 +121,7 @@ def action_losses(
         "gripper": gripper,
     }
     if config.heatmap > 0:
-        terms["heatmap"] = heat_loss(predicted.log_heat, cloud, target[:, :7], config.approach)
+        terms["heatmap"] = heat_loss(predicted.log_heat, cloud, valid, target[:, :7], config.approach)
     return terms
 
 

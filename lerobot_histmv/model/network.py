@@ -243,11 +243,18 @@ class HistMVNet(nn.Module):
         steps = torch.arange(len(shares), device=shares.device)
         return predicted, torch.stack([steps, most_informative(shares)], dim=-1)
 
-    def heat_cloud(self, encoding: Encoding, views: Int[Tensor, "m 2"]) -> Float[Tensor, "m 3 y x"]:
-        """World points [m] under the heat maps of decoded pairs: of the pair's view, or of all views of its step."""
+    def heat_cloud(
+        self, encoding: Encoding, views: Int[Tensor, "m 2"]
+    ) -> tuple[Float[Tensor, "m 3 y x"], Bool[Tensor, "m y x"]]:
+        """World points [m] under the heat maps of decoded pairs, of the pair's view or of all of its step's views.
+
+        Also which of them are valid.
+        """
+        cloud, valid = encoding.cloud, encoding.valid
         if self.config.views.decode == "all":
-            return rearrange(encoding.cloud, "n k c y x -> n c (k y) x")
-        return pick_images(encoding.cloud.flatten(0, 1), views, encoding.weights.shape[1])
+            return rearrange(cloud, "n k c y x -> n c (k y) x"), rearrange(valid, "n k y x -> n (k y) x")
+        pick = partial(pick_images, views=views, k=encoding.weights.shape[1])
+        return pick(cloud.flatten(0, 1)), pick(valid.flatten(0, 1))
 
     @staticmethod
     def _cell_means(scaled: Float[Tensor, "n k 3 y x"], valid: Bool[Tensor, "n k y x"]) -> Float[Tensor, "n k 3 h w"]:

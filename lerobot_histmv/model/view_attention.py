@@ -41,9 +41,11 @@ def gaussian_mutual_information(first: Float[Tensor, "*n s d"], second: Float[Te
 def mutual_information_matrix(
     maps: Float[Tensor, "n k d h w"], projection: Float[Tensor, "d e"]
 ) -> Float[Tensor, "n k k"]:
-    """I [nat] between all pairs of views (Eq. 5), diagonal 0: what a map tells of itself has no bound."""
-    samples = einsum(maps, projection, "n k d h w, d e -> n k h w e")
-    samples = rearrange(samples, "n k h w e -> n k (h w) e")
+    """I [nat] between all pairs of views (Eq. 5), diagonal 0: what a map tells of itself has no bound.
+
+    Channels are standardised before they are mixed: gain and bias of a channel do not matter, and no loud one decides.
+    """
+    samples = standardise(rearrange(maps, "n k d h w -> n k (h w) d")) @ projection
     k = samples.shape[1]
     first, second = torch.triu_indices(k, k, offset=1, device=maps.device).unbind(0)
     pairs = gaussian_mutual_information(samples[:, first], samples[:, second])

@@ -30,6 +30,7 @@ from dataset_tools.explain.view_panels import draw_information, draw_weights
 from dataset_tools.explain.watch import Record, watched
 from dataset_tools.page import draw_panels
 from lerobot_histmv import keys
+from lerobot_histmv.control import ControlConfig
 from lerobot_histmv.geometry import project
 from lerobot_histmv.model.config import HistoryConfig, ViewConfig
 from lerobot_histmv.model.history import Lookback
@@ -69,8 +70,20 @@ def test_watching_changes_nothing_and_leaves_nothing(
     policy.reset()
     actions = torch.cat([policy.select_action(observation(episode(STEPS), step)) for step in range(STEPS)])
     assert actions.equal(acted[0])
-    assert "select_action" not in vars(policy)
+    assert "_decide" not in vars(policy)
     assert not any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
+
+
+def test_a_decision_held_over_ticks_is_recorded_once(policy: HistMVPolicy) -> None:
+    held = tiny_policy(dataclasses.replace(policy.config, control=ControlConfig(rate=20)))
+    held.load_state_dict(policy.state_dict())
+    batch = observation(episode(1), 0)
+    policy.reset()
+    with watched(held) as records:
+        outputs = [held.select_action(batch) for _ in range(3)]
+    (record,) = records
+    np.testing.assert_allclose(record.action, policy.select_action(batch)[0], atol=1e-6)
+    assert not torch.allclose(outputs[0][0, :3], torch.from_numpy(record.action[:3]), atol=1e-3)
 
 
 def test_records_hold_what_the_policy_decided(policy: HistMVPolicy) -> None:

@@ -6,14 +6,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from lerobot_histmv.model import losses
 from lerobot_histmv.model.config import LossConfig
-from lerobot_histmv.model.decoder import Prediction
+from lerobot_histmv.model.decoder import Prediction, spatial_log_softmax
 from lerobot_histmv.model.losses import (
     AXIS_REACH,
     BEHIND,
     PARAPHRASE_TEMPERATURE,
     action_losses,
-    heat_loss,
     paraphrase_loss,
     quaternion_loss,
     term_weights,
@@ -21,6 +21,13 @@ from lerobot_histmv.model.losses import (
 )
 
 M, Y, X = 3, 5, 7
+
+
+def heat_loss(
+    log_heat: torch.Tensor, cloud: torch.Tensor, target: torch.Tensor, approach: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> torch.Tensor:
+    """The loss where all pixels that have any heat count."""
+    return losses.heat_loss(log_heat, cloud, log_heat > -torch.inf, target, approach)
 
 
 def unit(count: int, seed: int) -> torch.Tensor:
@@ -161,27 +168,32 @@ def test_heat_loss_is_zero_where_the_target_is_not_seen() -> None:
     torch.testing.assert_close(heat_loss(uniform, cloud, target + 5 * torch.eye(7)[2]), torch.zeros(M))
 
 
-def test_heat_loss_is_finite_with_invalid_pixels_and_for_a_view_without_any() -> None:
-    uniform, cloud, target = heat_case()
-    logits = uniform.clone()
-    logits[0, 2:] = -torch.inf
-    logits[1] = -torch.inf
-    logits.requires_grad_()
-    loss = heat_loss(logits, cloud, target)
+def test_heat_loss_is_finite_with_invalid_pixels_and_0_for_a_view_without_any() -> None:
+    """Such a view's heat map is uniform, over points that all lie in its camera."""
+    _, cloud, target = heat_case()
+    valid = torch.ones(M, Y, X, dtype=torch.bool)
+    valid[0, 2:] = False
+    valid[1] = False
+    cloud[1] = target[1, :3, None, None] + 0.1
+    logits = torch.randn(M, Y, X, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    loss = losses.heat_loss(spatial_log_softmax(logits, valid), cloud, valid, target)
     loss.sum().backward()
     assert loss.isfinite().all()
     assert logits.grad is not None
     assert logits.grad.isfinite().all()
     assert loss[1] == 0
+    assert not logits.grad[1].any()
+    assert loss[[0, 2]].gt(0).all()
 
 
-def prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor]:
+def prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.Tensor]:
     log_heat, cloud, target = heat_case()
     position = target[:, :3]
     gripper = torch.tensor([2.0, -1.0, 0.5])
     reached = position + torch.tensor([0.0, 0.03, 0.04])
     predicted = Prediction(reached, position, unit(M, 2), gripper, log_heat, certainty=torch.ones(M))
-    return predicted, torch.cat([position, unit(M, 3), torch.tensor([[1.0], [0.0], [0.0]])], dim=1), cloud
+    wanted = torch.cat([position, unit(M, 3), torch.tensor([[1.0], [0.0], [0.0]])], dim=1)
+    return predicted, wanted, cloud, torch.ones(M, Y, X, dtype=torch.bool)
 
 
 def test_position_loss_is_the_squared_distance_in_its_unit() -> None:

@@ -1,6 +1,7 @@
 """The Gaussian estimate of mutual information against closed forms, and the view weights that each loss form wants."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -8,11 +9,13 @@ import torch
 from lerobot_histmv.model.view_attention import (
     gaussian_mutual_information,
     mutual_information_loss,
+    mutual_information_matrix,
     normalised_mutual_information,
     standardise,
 )
 
 DRAWS, SAMPLES, DIMS = 11, 4096, 5
+Measure = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def correlated(
@@ -124,6 +127,17 @@ def test_normalised_information_follows_the_order_of_views(k: int) -> None:
     order = torch.arange(k).roll(1)
     matrix = normalised_mutual_information(maps, projection)
     torch.testing.assert_close(normalised_mutual_information(maps[:, order], projection), matrix[:, order][:, :, order])
+
+
+@pytest.mark.parametrize("measure", [mutual_information_matrix, normalised_mutual_information])
+def test_information_of_maps_ignores_gain_sign_and_offset_of_each_channel(measure: Measure) -> None:
+    """Also through the projection, in which otherwise the loudest channel would decide."""
+    maps = torch.randn(2, 3, 11, 13, 17, generator=torch.Generator().manual_seed(0))
+    maps[:, 1, 4] += 2 * maps[:, 0, 4]
+    projection = torch.linalg.qr(torch.randn(11, 3, generator=torch.Generator().manual_seed(1)))[0]
+    gain = torch.logspace(-2, 2, 11)[torch.randperm(11, generator=torch.Generator().manual_seed(2))]
+    changed = gain[:, None, None] * maps + torch.arange(11.0)[:, None, None]
+    torch.testing.assert_close(measure(changed, projection), measure(maps, projection), atol=1e-3, rtol=1e-3)
 
 
 REDUNDANT_PAIR = torch.tensor([[1.0, 0.9, 0.1], [0.9, 1.0, 0.1], [0.1, 0.1, 1.0]])

@@ -129,6 +129,24 @@ def test_frozen_towers_do_not_mix_the_images_of_a_batch(monkeypatch: pytest.Monk
     torch.testing.assert_close(towers.images(rgb)[:, :1], towers.images(rgb[:, :1]), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("name", "width"), [("convnext_tiny", 1024), ("coca_ViT-B-32", 512)])
+def test_towers_of_other_makers_give_both_vectors_without_idle_weights(name: str, width: int) -> None:
+    """timm's image towers do not tell their width, and CoCa has a decoder for captions."""
+    towers = Semantics(SemanticsConfig(clip_model=name, train_clip=True))
+    images, text = towers.images(torch.rand(1, 2, 3, 48, 48)), towers.text(["press the button"], CPU)
+    assert images.shape == (1, 2, width)
+    assert text.shape == (1, width)
+    (images.sum() + text.sum()).backward()
+    assert [name for name, parameter in towers.named_parameters() if parameter.grad is None] == []
+
+
+def test_vectors_learned_in_half_precision_are_kept_in_full(weights_file: Path) -> None:
+    towers = Semantics(SemanticsConfig(clip_pretrained=str(weights_file)))
+    with torch.autocast("cpu", torch.bfloat16):
+        towers.text(["press the button"], CPU)
+    assert towers.text(["press the button"], CPU).dtype == torch.float32
+
+
 def test_frozen_random_weights_belong_to_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(semantics, "create_clip", lambda *_: open_clip.CLIP(**semantics.TINY))
     towers = Semantics(SemanticsConfig(clip_model="ViT-S-32-alt"))

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_scene import SIZE, cameras_around, noise_images
 
 from lerobot_histmv import keys
+from lerobot_histmv.model import augment
 from lerobot_histmv.model.augment import AugmentConfig, random_world_motion
 from lerobot_histmv.model.cameras import project
 from lerobot_histmv.windows import Window, causal_heat, look_back, read_window
@@ -241,6 +242,12 @@ def test_a_lost_view_is_black_and_without_depth_in_all_steps_of_its_window() -> 
     counts = torch.cat(lost).float().sum(dim=0)
     assert (counts > 0).all()
     assert 0.3 < counts.sum() / (31 * B) < 0.7
+
+
+def test_the_only_camera_never_fails() -> None:
+    """Else the policy would be taught where to go with nothing seen."""
+    assert not augment.draw_views(101, 1, 1.0).any()
+    assert augment.draw_views(101, 2, 1.0).sum(dim=1).eq(1).all()
 
 
 def test_a_card_hides_one_rectangle_of_one_view_in_all_steps_of_its_window() -> None:
