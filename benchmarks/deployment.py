@@ -3,7 +3,7 @@
     python benchmarks/deployment.py --policy=outputs/.../pretrained_model --task=pick_and_lift [--episodes=20]
 
 Killed and started again, it continues. Per way: successes, 95 % interval, failed scenes and simulated seconds go to
-``benchmarks/results/deployment.json``.
+``benchmarks/results/deployment.json``, with the fingerprint of the checkpoint's weights.
 """
 
 import argparse
@@ -99,10 +99,12 @@ def main() -> None:
     ways["lerobot-rollout"] = summary({int(seed): ": success" in said for seed, said in reports.items()})
     seconds = [float(re.findall(r"after ([\d.]+) s", said)[0]) for said in reports.values()]
     ways["lerobot-rollout"]["mean_seconds"] = round(sum(seconds) / len(seconds), 2)
+    settings = json.loads((folder / "macro" / "eval_info.json").read_text())["settings"]
+    result = ways | {"weights_sha256": settings["policy"]["weights_sha256"]}
     RESULTS.parent.mkdir(exist_ok=True)
     with FileLock(RESULTS.parent / ".lock"):
         known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
-        write_json(RESULTS, dict(sorted((known | {args.task: ways}).items())))
+        write_json(RESULTS, dict(sorted((known | {args.task: result}).items())))
     print(json.dumps(ways, indent=2))
 
 

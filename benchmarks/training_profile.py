@@ -4,8 +4,8 @@
 
 Runs the default network's training step on full windows (11 rows, three views, 128 x 128 pixels), times every operation
 that has FLOPs (convolutions, matrix products, attention; forward and backward) inside of the step, then repeats each
-alone with the same shapes and memory layouts: means inside of the step against the shortest time alone. ``--table`` also prints the operations that take longest. Writes
-``benchmarks/results/training_profile.json``, one entry per number of windows.
+alone with the same shapes and memory layouts: means inside against the shortest time alone. ``--table`` also prints the
+operations that take longest. Writes ``benchmarks/results/training_profile.json``, one entry per number of windows.
 """
 
 import argparse
