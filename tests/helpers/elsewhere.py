@@ -18,7 +18,11 @@ DEVICE = torch.device("meta")
 aten = torch.ops.aten
 MOVES = {aten._to_copy.default, aten.copy_.default}
 INDEXING = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default}
-"""On a GPU too, indices may lie on the CPU."""
+"""On a GPU too, indices of its tensors may lie on the CPU; those of the CPU's tensors may not lie on the GPU."""
+ANSWERS = {aten._local_scalar_dense.default, aten.equal.default}
+"""Give Python a number or a truth: ``item``, ``bool``, ``equal``."""
+COUNTS = {aten.nonzero.default, aten.masked_select.default, aten._unique2.default, aten.repeat_interleave.Tensor}
+"""The CPU has to know how large their results are."""
 
 
 class Elsewhere(Tensor):
@@ -59,7 +63,7 @@ def compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     Raises:
         RuntimeError: its tensors lie on both devices.
     """
-    checked = args[:1] + args[2:] if operation in INDEXING else args
+    checked = args[:1] + args[2:] if operation in INDEXING and isinstance(args[0], Elsewhere) else args
     tensors = [value for value in tree_leaves((checked, kwargs)) if isinstance(value, Tensor)]
     away = [tensor for tensor in tensors if isinstance(tensor, Elsewhere)]
     here = [tensor for tensor in tensors if not isinstance(tensor, Elsewhere) and tensor.ndim]
@@ -83,8 +87,18 @@ def compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(wrap, found)
 
 
+def returns(operation: Any, args: Any, found: Any) -> tuple[int, ...] | None:
+    """Shape of what the operation brings back to the CPU, () for a number; None if it leaves the device alone."""
+    if not any(isinstance(value, Elsewhere) for value in tree_leaves(args)):
+        return None
+    if operation in MOVES and not isinstance(found, Elsewhere):
+        return tuple(found.shape)
+    picks = operation in INDEXING and any(index is not None and index.dtype == torch.bool for index in args[1])
+    return () if picks or operation in ANSWERS | COUNTS else None
+
+
 class _SecondDevice(TorchDispatchMode):
-    """Makes ``device="meta"`` mean the second device, and notes what is moved back from it."""
+    """Makes ``device="meta"`` mean the second device, and notes what comes back from it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -92,9 +106,9 @@ class _SecondDevice(TorchDispatchMode):
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = compute(operation, args, kwargs or {})
-        moved = operation in MOVES and any(isinstance(value, Elsewhere) for value in args)
-        if moved and not isinstance(found, Elsewhere):
-            self.returned.append(tuple(found.shape))
+        shape = returns(operation, args, found)
+        if shape is not None:
+            self.returned.append(shape)
         return found
 
 
@@ -112,6 +126,9 @@ class _FromNumbers(TorchFunctionMode):
 
 @contextmanager
 def second_device() -> Iterator[list[tuple[int, ...]]]:
-    """Inside, ``meta`` is the second device; gives the shapes of all tensors moved back to the CPU so far."""
+    """Inside, ``meta`` is the second device; gives the shapes of all that has come back to the CPU so far.
+
+    A number that Python asked for, or the size of a result that depends on values, has the shape ().
+    """
     with _FromNumbers(), _SecondDevice() as mode:
         yield mode.returned

@@ -7,14 +7,26 @@ import torch
 from tiny_scene import tiny_network
 
 from lerobot_histmv.model import semantics
-from lerobot_histmv.model.config import NetworkConfig, SemanticsConfig, ViewConfig
+from lerobot_histmv.model.config import (
+    DecoderConfig,
+    HistoryConfig,
+    NetworkConfig,
+    PointsConfig,
+    SemanticsConfig,
+    TextureConfig,
+    ViewConfig,
+)
 
 CHOICES = ["argmax", "sampled", "expected", "ranked"]
 """Views decoded in training where one view decides."""
 
 
 def networks(folder: Path) -> dict[str, NetworkConfig]:
-    """Every way to fuse and to choose views, and frozen towers, which lie outside of the policy's module tree."""
+    """Every way to fuse and to choose views; frozen towers, which lie outside of the policy's module tree; parts off.
+
+    "global vector alone" has neither texture nor points nor history nor what the paper's decoder lacks, "texture alone"
+    no image tower.
+    """
     weights = folder / "clip.pt"
     torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
     return {
@@ -23,4 +35,11 @@ def networks(folder: Path) -> dict[str, NetworkConfig]:
         **{fusion: tiny_network(views=ViewConfig(fusion=fusion)) for fusion in ("mean", "tokens")},
         "weight": tiny_network(views=ViewConfig(decode="one", act="weight")),
         "frozen": tiny_network(semantics=SemanticsConfig(clip_pretrained=str(weights))),
+        "global vector alone": tiny_network(
+            texture=TextureConfig(encoder="none", widths=(4, 4, 8, 8), neck=4),
+            points=PointsConfig(enabled=False),
+            history=HistoryConfig(enabled=False, past_steps=2, layers=2, heads=2),
+            decoder=DecoderConfig(opening=False, tool_frame=False, ray=False, local=False, peak=False),
+        ),
+        "texture alone": tiny_network(semantics=SemanticsConfig(image="none")),
     }
