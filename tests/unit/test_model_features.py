@@ -29,6 +29,28 @@ def test_panet_aggregates_paths_both_ways() -> None:
         assert all(gradient.abs().sum() > 0 for gradient in gradients)
 
 
+def test_panet_equals_its_definition_level_by_level() -> None:
+    """Down: a level's own lateral map and the coarser one repeated; up: its own map of the way down and the finer one
+    halved, so that the finest is that of the way down alone."""
+    torch.manual_seed(0)
+    channels, sizes = [3, 5, 7, 2], [(8, 24), (4, 12), (2, 6), (1, 3)]
+    levels = [torch.randn(N, c, *size) for c, size in zip(channels, sizes, strict=True)]
+    neck = PANet(channels, 11)
+
+    def down(i: int) -> torch.Tensor:
+        lateral = neck.lateral[i]
+        own = torch.einsum("ec,ncyx->neyx", lateral.weight[..., 0, 0], levels[i]) + lateral.bias[:, None, None]
+        if i == len(levels) - 1:
+            return own
+        return neck.top_down[i](own + down(i + 1).repeat_interleave(2, dim=2).repeat_interleave(2, dim=3))
+
+    def up(i: int) -> torch.Tensor:
+        return neck.bottom_up[i - 1](down(i) + neck.shrink[i - 1](up(i - 1))) if i else down(0)
+
+    for i, found in enumerate(neck(levels)):
+        torch.testing.assert_close(found, up(i))
+
+
 def images(k: int = K) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(k)
     return {
