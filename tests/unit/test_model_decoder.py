@@ -191,6 +191,19 @@ def test_rotation_turns_with_the_tool_only_in_the_tool_s_frame(tool_frame: bool)
     assert decode(module, given).quaternion.equal(before) != tool_frame
 
 
+def test_mixed_precision_rounds_no_action_that_follows_from_the_same_numbers() -> None:
+    """Half precision may compute the numbers; what they mean in the tool's frame and along the ray, it may not."""
+    given, module = inputs(), decoder()
+    numbers = torch.randn(M, 17, generator=torch.Generator().manual_seed(2))
+    module.position = Planted(logits_and_mask()[0])
+    module.pose.register_forward_hook(lambda *_: numbers)
+    expected = decode(module, given)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = decode(module, given)
+    for name, values in vars(expected).items():
+        assert vars(found)[name].equal(values), name
+
+
 def test_heat_map_learns_to_point_at_a_target_on_the_cloud() -> None:
     given, module = inputs(), decoder()
     target = given["cloud"][:, :, 11, 13]
