@@ -109,6 +109,18 @@ def test_equation_6_sums_information_in_nats(form: str, sign: int) -> None:
     assert found.item() == pytest.approx(expected, rel=0.03)
 
 
+def test_default_redundancy_is_the_views_weighted_pairs_by_absolute_correlation() -> None:
+    """w' NMI w, in which NMI is |rho| of Gaussian views: each pair counts twice, each view once with itself."""
+    generator, rho = torch.Generator().manual_seed(0), 0.6
+    first, noise = torch.randn(2, D, 101, 103, generator=generator)
+    maps = torch.stack([first, noise, (1 - rho**2) ** 0.5 * noise - rho * first])[None]
+    w = [0.5, 0.3, 0.2]
+    shared = {(0, 2): rho, (1, 2): (1 - rho**2) ** 0.5}
+    expected = sum(share**2 for share in w) + sum(2 * w[i] * w[j] * nmi for (i, j), nmi in shared.items())
+    found = attention().redundancy(maps, torch.tensor([w]))
+    assert found.item() == pytest.approx(expected, rel=0.01)
+
+
 def test_projection_does_not_depend_on_the_global_seed_and_is_orthogonal() -> None:
     torch.manual_seed(5)
     first = attention().projection
