@@ -78,11 +78,9 @@ def test_cached_decisions_equal_those_of_the_last_window_of_a_long_episode(polic
     assert bool(action[7]) == bool(predicted.gripper[-1] > 0)
 
 
-def test_training_learns_the_decisions_that_acting_makes(policy: HistMVPolicy) -> None:
-    """Around a row amid a long episode: of all rows whose history is there, and of these only."""
-    drawn, steps = LONG, 3 * LONG
-    rows = episode(steps)
-    actions = act(policy, rows, steps)
+def assert_training_learns_what_acting_does(policy: HistMVPolicy, rows: dict[str, torch.Tensor], drawn: int) -> None:
+    """Of all rows around the drawn one whose history is there, and of these only."""
+    actions = act(policy, rows, len(rows[keys.STATE]))
     window = read_window(window_of(rows, drawn, LONG - 1), policy.config.cameras)
     lookback, _ = look_back(window.real)
     seen = window.observe(policy.net.semantics.text([TASK], torch.device("cpu")))
@@ -95,6 +93,11 @@ def test_training_learns_the_decisions_that_acting_makes(policy: HistMVPolicy) -
         torch.from_numpy(canonical(predicted.quaternion)).float(), actions[learned, 3:7], atol=1e-5, rtol=0
     )
     assert (predicted.gripper > 0).float().equal(actions[learned, 7])
+
+
+def test_training_learns_the_decisions_that_acting_makes(policy: HistMVPolicy) -> None:
+    """Around a row amid a long episode."""
+    assert_training_learns_what_acting_does(policy, episode(3 * LONG), LONG)
 
 
 def test_decisions_far_beyond_the_window_stay_finite_and_forget_the_oldest_step(policy: HistMVPolicy) -> None:
