@@ -17,7 +17,7 @@ from tiny_weights import clip_file
 from dataset_tools import config_files
 from lerobot_histmv.configuration_histmv import HistMVConfig
 from lerobot_histmv.geometry import canonical
-from lerobot_histmv.model.config import LossConfig, NetworkConfig
+from lerobot_histmv.model.config import HistoryConfig, LossConfig, NetworkConfig
 from lerobot_histmv.modeling_histmv import HistMVPolicy
 
 ABLATIONS = [name for name in config_files.names() if name.startswith("ablation/")]
@@ -137,11 +137,27 @@ def test_the_default_preset_has_all_that_ablations_switch_off() -> None:
     assert (network.texture.encoder, network.semantics.image) == ("panet", "clip")
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_take_what_the_paper_leaves_open_from_hiveformer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the decay: a cosine that ends at 0, as Hiveformer's straight line does."""
+    documented = re.search(r"weight decay (\S+), clipping at (\d+), ([\d,]+) steps of warm-up", TEXT)
+    assert documented is not None
+    cfg = load(config_files.find(name), monkeypatch)
+    policy = cfg.policy
+    assert isinstance(policy, HistMVConfig)
+    optimizer = policy.get_optimizer_preset()
+    assert (cfg.batch_size, cfg.steps, optimizer.lr) == (16, 100_000, 5e-4)
+    assert (
+        (optimizer.weight_decay, optimizer.grad_clip_norm) == (float(documented[1]), float(documented[2])) == (1e-3, 5)
+    )
+    assert policy.warmup_fraction * cfg.steps == int(documented[3].replace(",", "")) == 2000
+    assert policy.final_lr_fraction == 0
+
+
 def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> None:
     cfg = load(config_files.find("train/paper"), monkeypatch)
     assert isinstance(cfg.policy, HistMVConfig)
     network, loss = cfg.policy.network, cfg.policy.loss
-    assert (cfg.batch_size, cfg.steps, cfg.policy.get_optimizer_preset().lr) == (16, 100_000, 5e-4)
     assert len(cfg.policy.cameras) == 3
     assert (network.texture.encoder, network.texture.language, network.texture.use_xyz) == ("panet", False, False)
     semantics = network.semantics
@@ -151,7 +167,11 @@ def test_the_paper_s_preset_is_the_paper_s(monkeypatch: pytest.MonkeyPatch) -> N
     assert (views.fusion, views.decode, views.train_choice) == ("attention", "one", "argmax")
     assert (views.mi_loss, views.mi_gradient, views.act) == ("literal", True, "weight")
     assert network.points.enabled
-    assert network.history.enabled
+    history = network.history
+    assert (network.width, history.enabled, history.past_steps, history.skip_first) == (64, True, 5, True)
+    window = re.search(r"window of up to (\d+) rows, of which each decision sees up\s+to (\d+)", TEXT)
+    assert window is not None
+    assert [len(cfg.policy.observation_delta_indices), history.memory + 1] == [int(rows) for rows in window.groups()]
     assert set(vars(network.decoder).values()) == {False}
     assert loss == LossConfig(
         action=1.0, mutual_information=0.01, heatmap=0.0, choice=0.0, paraphrase=0.0, gripper="mse", position_unit=1.0
@@ -167,8 +187,8 @@ def test_the_peer_has_nothing_of_ours_in_its_network(monkeypatch: pytest.MonkeyP
     assert (network.texture.encoder, network.texture.language, network.texture.use_xyz) == ("backbone", False, False)
     assert network.semantics.image == "none"
     assert not network.points.enabled
-    assert network.history.enabled
-    assert not network.history.skip_first
+    assert network.width == 32 and set(network.texture.widths) == {32}
+    assert network.history == HistoryConfig(past_steps=10, layers=1, heads=8, dropout=0.1, skip_first=False)
     assert set(vars(network.decoder).values()) == {False}
     assert (loss.heatmap, loss.position_unit) == (0, 1)
     assert cfg.policy.augment == replace(STILL, pixels=8)
