@@ -29,30 +29,36 @@ def actions(policy: HistMVPolicy) -> torch.Tensor:
 
 
 KINDS = ["all", "mean", "tokens", "ranked", "frozen"]
-"""Networks in which rounding cannot make another view act."""
+"""Networks in which rounding cannot make another view act.
+
+Their seeds keep the episodes away from two other edges of an untrained network, where the least rounding decides: which
+of two equal peaks is the higher, and which sign of a quaternion is the nearer.
+"""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_keeps_the_loss_and_the_direction_of_the_gradient(kind: str, tmp_path: Path) -> None:
+    """Bounds are about twice what was measured: the loss within 0.22 %, the cosine from 0.963 up."""
     config = tiny_config(network=networks(tmp_path)[kind])
     expected, gradient = step(tiny_policy(config))
     with torch.autocast("cpu", torch.bfloat16):
         loss, found = step(tiny_policy(config))
     assert {loss.dtype, *(one.dtype for one in found)} == {torch.float32}
-    torch.testing.assert_close(loss, expected, rtol=0.02, atol=0)
+    torch.testing.assert_close(loss, expected, rtol=0.005, atol=0)
     both = (torch.cat([one.flatten() for one in gradients]) for gradients in (found, gradient))
-    assert 0.9 < torch.cosine_similarity(*both, dim=0) < 1 - 1e-6, "1 would mean that nothing was rounded"
+    assert 0.925 < torch.cosine_similarity(*both, dim=0) < 1 - 1e-6, "1 would mean that nothing was rounded"
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_moves_no_action_by_millimetres(kind: str, tmp_path: Path) -> None:
+    """Bounds are twice what was measured: 1.0 mm, and 0.009 in a quaternion's components but for "mean"'s 0.023."""
     config = tiny_config(network=networks(tmp_path)[kind])
     expected = actions(tiny_policy(config))
     with torch.autocast("cpu", torch.bfloat16):
         found = actions(tiny_policy(config))
     assert found.dtype == torch.float32
     assert 0 < (found - expected)[:, :3].norm(dim=1).max() < 2e-3, "0 would mean that nothing was rounded"
-    torch.testing.assert_close(found[:, 3:7], expected[:, 3:7], atol=0.03, rtol=0)
+    torch.testing.assert_close(found[:, 3:7], expected[:, 3:7], atol=0.045 if kind == "mean" else 0.018, rtol=0)
     assert found[:, 7].equal(expected[:, 7])
 
 

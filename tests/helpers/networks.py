@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-import open_clip
-import torch
 from tiny_scene import tiny_network
+from tiny_weights import clip_file
 
-from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import (
     DecoderConfig,
     HistoryConfig,
@@ -27,8 +25,7 @@ def networks(folder: Path) -> dict[str, NetworkConfig]:
     "global vector alone" has neither texture nor points nor history nor what the paper's decoder lacks, "texture alone"
     no image tower.
     """
-    weights = folder / "clip.pt"
-    torch.save(open_clip.CLIP(**semantics.TINY).state_dict(), weights)
+    weights = clip_file(folder / "clip.pt", seed=2)
     return {
         "all": tiny_network(),
         **{choice: tiny_network(views=ViewConfig(decode="one", train_choice=choice)) for choice in CHOICES},
