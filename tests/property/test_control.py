@@ -1,6 +1,7 @@
 """A held decision: outputs keep to box and speeds whatever is decided and measured, in a macro step's order."""
 
 from dataclasses import replace
+from itertools import groupby, pairwise
 
 import numpy as np
 import pytest
@@ -24,8 +25,8 @@ configs = st.builds(
     rate=st.sampled_from([7.0, 20.0, 53.0]),
     speed=st.floats(0.05, 0.7),
     turn_rate=st.floats(0.1, 3),
-    lead=st.floats(0.11, 0.5),
-    turn_lead=st.floats(0.5, 3),
+    lead=st.floats(0.11, 0.3),
+    turn_lead=st.floats(0.45, 1),
     timeout=st.floats(0, 0.5),
     gripper_time=st.floats(0, 0.3),
     settle_time=st.floats(0, 0.3),
@@ -43,31 +44,57 @@ def held(config: ControlConfig = CONFIG, state: np.ndarray = START) -> HeldStep:
     return HeldStep(config, LOW, HIGH, state)
 
 
-def follow(step: HeldStep, decision: np.ndarray, state: np.ndarray = START) -> list[np.ndarray]:
-    """Outputs of one macro step with an arm that is, one tick later, where it was told to be."""
-    outputs = [step.begin(decision, state)]
-    while (output := step.output(outputs[-1].astype(np.float64))) is not None:
+def follow(step: HeldStep, decision: np.ndarray, state: np.ndarray = START, stuck: float = 0) -> list[np.ndarray]:
+    """Outputs of one macro step with an arm that is, one tick later, where it was told to be.
+
+    It stands still until the output has waited for it ``stuck`` ticks.
+    """
+    outputs, waited = [step.begin(decision, state)], 0
+    while True:
+        state = outputs[-1].astype(np.float64) if waited >= stuck else state
+        if (output := step.output(state)) is None:
+            return outputs
+        waited += np.array_equal(output, outputs[-1])
         outputs.append(output)
-    return outputs
+
+
+def turned(angle: float, offset: float = 0.0) -> np.ndarray:
+    """The start, turned [rad] and moved [m]."""
+    return np.array([START[0] + offset, *START[1:3], np.cos(angle / 2), 0, 0, np.sin(angle / 2), START[7]])
+
+
+def longest_rest(outputs: list[np.ndarray]) -> int:
+    """Most ticks in a row for which the output stayed where it was."""
+    return max(sum(1 for _ in same) for _, same in groupby(map(tuple, outputs))) - 1
 
 
 @FEW
 @given(configs, poses(-3, 3), st.lists(poses(-3, 3), min_size=1, max_size=4), st.randoms(use_true_random=False))
-def test_no_output_leaves_the_box_or_exceeds_the_speeds(config, start, decisions, chance) -> None:
-    """The arm follows, lags, stands still or seems to jump, as chance has it."""
+def test_no_output_leaves_the_box_exceeds_the_speeds_or_runs_ahead(config, start, decisions, chance) -> None:
+    """The arm follows, lags, stands still or seems to jump or to be twisted, as chance has it.
+
+    An output that is ahead when the tool jumps away stays where it is: it may not move on.
+    """
     inside = np.concatenate([np.clip(start[:3], LOW, HIGH), start[3:]])
     step, last, state = held(config, inside), inside, inside
     for decision in decisions:
-        output = step.begin(decision, state)
-        for _ in range(50):
+        waited = 0
+        for tick in range(50):
+            output = step.output(state) if tick else step.begin(decision, state)
+            if output is None:
+                break
             assert ((output[:3] >= LOW - 1e-6) & (output[:3] <= HIGH + 1e-6)).all()
             assert np.linalg.norm(output[:3] - last[:3]) <= 1.001 * config.speed / config.rate + 1e-6
             assert angle_between(output[3:7], last[3:7]) <= 1.001 * config.turn_rate / config.rate + 2e-3
             assert output[7] in (0, 1)
+            if np.array_equal(output[:7], last[:7]):
+                waited += 1
+            elif waited < config.ticks(config.timeout):
+                assert np.linalg.norm(output[:3] - state[:3]) <= config.lead + 1e-6
+                assert angle_between(output[3:7], state[3:7]) <= config.turn_lead + 2e-3
             last = output.astype(np.float64)
-            state = chance.choice([last, last, last, state, start])
-            if (output := step.output(state)) is None:
-                break
+            twisted = np.concatenate([last[:3], start[3:]])
+            state = chance.choice([last, last, last, state, start, twisted])
 
 
 @FEW
@@ -122,6 +149,53 @@ def test_a_slow_arm_is_waited_for() -> None:
         state[:3] += 0.1 * (output[:3] - state[:3])
     assert not any(arrived[:-SETTLE_TICKS])
     assert all(arrived[-SETTLE_TICKS:])
+
+
+def test_an_arm_that_is_there_but_not_yet_turned_is_waited_for() -> None:
+    goal, angle = 2.0, 0.0
+    step, state = held(replace(CONFIG, timeout=60)), START
+    step.begin(turned(goal), state)
+    ahead, missing = [], []
+    while (output := step.output(state)) is not None:
+        commanded = angle_between(output[3:7], START[3:7])
+        ahead.append(commanded - angle)
+        missing.append(goal - angle)
+        angle += 0.1 * (commanded - angle)
+        state = turned(angle)
+    assert CONFIG.turn_lead - 0.1 < max(ahead) <= CONFIG.turn_lead + 2e-3
+    assert min(missing[:-SETTLE_TICKS]) > CONFIG.turn_tolerance
+    assert max(missing[-SETTLE_TICKS:]) <= CONFIG.turn_tolerance
+
+
+BLOCKED = {
+    "on the way": turned(0, 0.4),
+    "at the end": turned(0, 0.07),
+    "on the turn": turned(1.3),
+    "at the turn's end": turned(0.3),
+}
+
+
+@pytest.mark.parametrize("decision", BLOCKED.values(), ids=BLOCKED)
+def test_a_blocked_arm_is_waited_for_as_long_as_the_timeout_says(decision: np.ndarray) -> None:
+    assert len(follow(held(), decision, stuck=TIMEOUT_TICKS)) == len(follow(held(), decision)) + TIMEOUT_TICKS
+    outputs = follow(held(), decision, stuck=np.inf)
+    assert longest_rest(outputs) == TIMEOUT_TICKS
+    np.testing.assert_allclose(outputs[-1], START, atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [13, np.inf], ids=["waited for", "timed out"])
+@pytest.mark.parametrize("decision", BLOCKED.values(), ids=BLOCKED)
+def test_each_step_waits_anew(decision: np.ndarray, first: float) -> None:
+    """The arm is blocked in two steps; in the second it comes free with the last tick of patience, and follows."""
+    step = held()
+    start = follow(step, decision, stuck=first)[-1].astype(np.float64)
+    back = START if first == 13 else decision
+    outputs = follow(step, back, start, stuck=TIMEOUT_TICKS)
+    assert len(outputs) == len(follow(held(state=start), back, start)) + TIMEOUT_TICKS
+    resting = next(tick for tick, (one, other) in enumerate(pairwise(outputs)) if np.array_equal(one, other))
+    assert np.linalg.norm(outputs[resting][:3] - start[:3]) <= CONFIG.lead + 1e-6
+    assert angle_between(outputs[resting][3:7], start[3:7]) <= CONFIG.turn_lead + 2e-3
+    np.testing.assert_allclose(outputs[-1], back, atol=1e-6)
 
 
 @pytest.mark.parametrize("component", range(8))
