@@ -96,11 +96,20 @@ def test_decisions_held_at_20_hz_do_what_macro_steps_do(task: str) -> None:
     env.close()
 
 
+def start_rollout(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str) -> None:
+    """Make ``lerobot_rollout.main`` what the command line would run with an untrained policy."""
+    checkpoint = write_checkpoint(folder / "checkpoint", size=(SIDE, SIDE))
+    views = [f"--robot.image_size={SIDE}", f"--robot.camera_names=[{','.join(CAMERAS)}]"]
+    scene = ["--robot.type=ur5_sim", "--robot.stop_when_done=true", *views]
+    pace = ["--fps=1000", "--duration=120", "--return_to_initial_position=false"]
+    words = ["lerobot-rollout", f"--policy.path={checkpoint}", *scene, *pace, *options]
+    monkeypatch.setattr(sys, "argv", words)
+
+
 def test_lerobot_rollout_drives_the_robot_until_the_task_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """LeRobot's own command, from its command line on; only the decision is the expert's."""
-    checkpoint = write_checkpoint(tmp_path / "checkpoint", size=(SIDE, SIDE))
     robots, looks, waiting = [], [], []
     connect = UR5Sim.connect
     monkeypatch.setattr(UR5Sim, "connect", lambda self, calibrate=True: (connect(self), robots.append(self)))
@@ -112,13 +121,46 @@ def test_lerobot_rollout_drives_the_robot_until_the_task_is_done(
         return torch.from_numpy(next(waiting[0]))[None]
 
     monkeypatch.setattr(HistMVPolicy, "_decide", decide)
-    scene = ["--robot.type=ur5_sim", "--robot.task=pick_and_lift", "--robot.seed=3", "--robot.stop_when_done=true"]
-    views = [f"--robot.image_size={SIDE}", f"--robot.camera_names=[{','.join(CAMERAS)}]"]
-    pace = ["--fps=1000", "--policy.control.rate=20", "--duration=120", "--return_to_initial_position=false"]
-    monkeypatch.setattr(sys, "argv", ["lerobot-rollout", f"--policy.path={checkpoint}", *scene, *views, *pace])
+    start_rollout(monkeypatch, tmp_path, "--robot.task=pick_and_lift", "--robot.seed=3", "--policy.control.rate=20")
     logging.getLogger(UR5Sim.__module__).addHandler(caplog.handler)  # LeRobot removes the handlers above it
     lerobot_rollout.main()
     logging.getLogger(UR5Sim.__module__).removeHandler(caplog.handler)
     assert "pick_and_lift, scene 3: success after" in caplog.messages[-1]
     assert not robots[0].is_connected
     assert min(np.diff(looks)) > 2, "a decision is held over many ticks"
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Filled with the actions that reach a robot."""
+    actions: list[dict[str, Any]] = []
+    send = UR5Sim.send_action
+    monkeypatch.setattr(UR5Sim, "send_action", lambda self, action: actions.append(action) or send(self, action))
+    return actions
+
+
+@pytest.mark.parametrize("name", ["ee.y.pos", "elbow.pos", "wrist.tz.pos"])
+def test_lerobot_rollout_sends_nothing_after_a_measurement_that_is_no_number(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sent: list[dict[str, Any]]
+) -> None:
+    observe, good = UR5Sim.get_observation, 5
+
+    def spoilt(self: UR5Sim) -> dict[str, Any]:
+        seen = observe(self)
+        assert name in seen
+        return seen | {name: np.nan} if len(sent) == good else seen
+
+    monkeypatch.setattr(UR5Sim, "get_observation", spoilt)
+    start_rollout(monkeypatch, tmp_path, "--robot.task=reach_target", "--policy.control.rate=20")
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        lerobot_rollout.main()
+    assert len(sent) == good
+
+
+def test_lerobot_rollout_sends_nothing_with_a_policy_of_whole_macro_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sent: list[dict[str, Any]]
+) -> None:
+    start_rollout(monkeypatch, tmp_path, "--robot.task=reach_target")
+    with pytest.raises(ValueError, match=r"policy\.control\.rate is 0.*--policy\.control\.rate=20 .*--fps=20"):
+        lerobot_rollout.main()
+    assert sent == []
