@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import numpy as np
 import pytest
 from fake_demonstrations import CAMERAS, FAILING_SEEDS, SIZE, recorder
 from fake_ur5 import write_checkpoint
+from helpers import scene
 from helpers.cards import commands_in, pushed
 from helpers.episodes import snapshot, write_picks
 from helpers.keyframed import SIZE as SQUARE
@@ -74,12 +76,26 @@ def test_keyframed_card_states_method_errors_calibration_and_source(keyed: Path)
         f"{1000 * told['totals']['error_max']:.1f} mm",
         "gap to the exact optimum",
         "datasets/ann/dense",
-        "| front | 19 x 17 | 20.00, 21.00, 9.00, 8.00 | 0.000, 0.000, 0.000 |",
+        "| front | 19 x 17 | 20.00, 21.00, 9.00, 8.00 | [[1.00000, 0.00000, 0.00000, 0.00000], [0.00000, 1.0",
         "Quaternions: w, x, y, z",
         'LeRobotDataset("ann/keys")',
         "--dataset.repo_id=ann/keys",
     ):
         assert part in found.text, part
+
+
+def test_cards_tell_the_whole_pose_of_fixed_cameras_and_that_others_move(tmp_path: Path) -> None:
+    """Numbers that ``histmv calibrate-attach`` would take for the same dataset without calibration."""
+    meta = LeRobotDatasetMetadata("test/scene", scene.write_scene(tmp_path / "scene"))
+    dataset = card.dataset_card(meta.root, meta, None).text
+    policy = tiny_policy(tiny_config()).generate_model_card("test/scene", "histmv", "mit", [], None, meta).text
+    for text in (dataset, policy):
+        rows = [line.strip("| ").split(" | ") for line in text.splitlines()]
+        told = {cells[0]: cells[-1] for cells in rows if cells[0] in scene.RIG.cameras}
+        assert told.pop(scene.RIG.moving) == f"moves with the tool: `{keys.EXTRINSICS}` tells the pose in every frame"
+        assert told.keys() == scene.STILL.keys()
+        for camera, pose in scene.STILL.items():
+            np.testing.assert_allclose(json.loads(told[camera]), pose, atol=0.6e-5)
 
 
 def test_the_cards_command_makes_the_same_data_again(keyed: Path, tmp_path: Path) -> None:
