@@ -47,13 +47,15 @@ class ExplainedFilm(Film):
 
     def __init__(self, records: Sequence[Record], path: Path, fps: int) -> None:
         super().__init__(path, fps)
-        self._records = records
+        self._records, self._shown = records, 0
 
     def show(self, scene: overlay.Scene, frames: Sequence[UInt8[np.ndarray, "y x 3"]]) -> None:
-        """Append the frames of one step beside the decision that led to it, which is shown before the arm moves."""
-        canvas = _canvas(self._records, scene.instruction)
-        self.hold(overlay.draw_frame(canvas, frames[0], f"step {scene.step}: decided"))
-        self.add(canvas, scene.step, frames)
+        """Append the frames of one step beside the decision that led to it; a new one is shown before the arm moves."""
+        if self._shown < len(self._records):
+            self._shown = len(self._records)
+            self._board = _canvas(self._records, scene.instruction)
+            self.hold(overlay.draw_frame(self._board, frames[0], f"decision {self._shown}"))
+        self.add(self._board, scene.step, frames)
 
 
 def film_rows(episode: Explained, path: Path, fps: int) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -13,13 +14,15 @@ from PIL import Image, ImageDraw
 from tiny_policy import TASK, episode, observation, tiny_config, tiny_policy
 from tiny_scene import SIZE, tiny_network
 
+from dataset_tools.eval_film import HOLD_SECONDS
 from dataset_tools.explain.board import BAR, LARGEST, LEFT, LINE, decision_text, draw_board, seen_target, tile
 from dataset_tools.explain.chapter import PANELS, decision_table, facts, notes
 from dataset_tools.explain.episode import Explained
+from dataset_tools.explain.sheet import ExplainedFilm
 from dataset_tools.explain.step_panels import draw_history, draw_poses
 from dataset_tools.explain.view_panels import THUMB, draw_information, draw_weights
 from dataset_tools.explain.watch import Record, watched
-from dataset_tools.overlay import CHOSEN, GAP, MUTED, TARGET, TRUTH
+from dataset_tools.overlay import CHOSEN, GAP, MUTED, TARGET, TRUTH, Scene
 from dataset_tools.page import draw_panels
 from lerobot_histmv.geometry import project
 from lerobot_histmv.model.config import HistoryConfig
@@ -53,6 +56,19 @@ def test_every_view_s_heat_is_drawn_where_it_peaks(acted: tuple[torch.Tensor, li
         tile = board[LINE + 2 : LINE + 2 + LARGEST, left : left + LARGEST].astype(int)[6:-6, 6:-6]
         hot = np.argwhere(tile[..., 0] - tile[..., 2] > 60).mean(axis=0) + 6
         assert hot == pytest.approx([(row + 0.5) * scale + inset, (column + 0.5) * scale], abs=3)
+
+
+def test_a_film_stops_once_for_each_decision_however_many_ticks_it_is_held(tmp_path: Path) -> None:
+    decisions, fps, frames = made_up([0, 2]), 5, np.zeros((1, 8, 8, 3), np.uint8)
+    shown: list[Record] = []
+    film = ExplainedFilm(shown, tmp_path / "film.mp4", fps)
+    for ticks, decision in zip((3, 4), decisions, strict=True):
+        shown.append(decision)
+        for tick in range(ticks):
+            film.show(Scene(TASK, tick + 1), list(frames))
+    film.finish("", True)
+    with av.open(str(tmp_path / "film.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == 3 + 4 + 3 * HOLD_SECONDS * fps
 
 
 def test_errors_are_measured_and_a_better_view_is_named(acted: tuple[torch.Tensor, list[Record]]) -> None:
