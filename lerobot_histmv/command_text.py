@@ -8,6 +8,8 @@ from typing import Any
 AGAIN = "again"
 """Folder, where the reader is, in which a card's commands make everything again."""
 DEMONSTRATIONS, KEYFRAMES, TRAINING = (f"{AGAIN}/{name}" for name in ("demonstrations", "keyframes", "training"))
+INSTALL = "pip install 'lerobot_policy_histmv[sim]'  # or '.[sim]' in a checkout of the project"
+"""First of the commands in every card."""
 
 
 def command(program: str, options: Mapping[str, Any]) -> str:

@@ -11,14 +11,13 @@ from huggingface_hub.constants import HUGGINGFACE_CO_URL_HOME
 import lerobot_histmv
 from lerobot_histmv import evaluation_text, keys
 from lerobot_histmv.calibration_text import calibration_table
-from lerobot_histmv.command_text import KEYFRAMES, TRAINING, command
+from lerobot_histmv.command_text import INSTALL, KEYFRAMES, TRAINING, command
 from lerobot_histmv.configuration_histmv import HistMVConfig
 
 LICENSE = "apache-2.0"
 PROJECT_TAGS = ("robotics", "lerobot", "histmv", "keyframes", "rgb-d")
 INSTRUCTIONS = 10
 """So many are printed; a policy may know hundreds."""
-INSTALL = "pip install 'lerobot_policy_histmv[sim]'"
 
 CONVENTIONS = """* World = robot base, metres, z up. Camera frame: x right, y down, z forward. Pixel (u, v)
   has its centre at (u, v).

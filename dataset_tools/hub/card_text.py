@@ -12,8 +12,7 @@ from dataset_tools.hub.card_commands import keyframe_command, record_command
 from dataset_tools.record_place import RECORDING_FILE
 from lerobot_histmv import keys
 from lerobot_histmv.calibration_text import calibration_table
-
-INSTALL = "pip install 'lerobot_policy_histmv[sim]'"
+from lerobot_histmv.command_text import INSTALL
 
 CONVENTIONS = """## Conventions
 
