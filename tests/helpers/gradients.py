@@ -8,8 +8,8 @@ from torch import Tensor
 OWN_ROUNDING, OTHERS_ROUNDING = 1e-3, 4e-5
 """Errors allowed, as shares of the largest number in the tensor and in all tensors.
 
-A gradient that is zero in exact arithmetic is what is left of large numbers that cancel: that of the heat map's bias, which a
-softmax ignores, is up to 1.4e-5 of the largest.
+A gradient that is zero in exact arithmetic is what is left of large numbers that cancel: that of the heat map's bias,
+which a softmax ignores, is up to 1.4e-5 of the largest.
 """
 
 
