@@ -53,9 +53,9 @@ class ExplainedFilm(Film):
         """Append the frames of one step beside the decision that led to it; a new one is shown before the arm moves."""
         if self._shown < len(self._records):
             self._shown = len(self._records)
-            self._board = _canvas(self._records, scene.instruction)
-            self.hold(overlay.draw_frame(self._board, frames[0], f"decision {self._shown}"))
-        self.add(self._board, scene.step, frames)
+            self._canvas = _canvas(self._records, scene.instruction)
+            self.hold(overlay.draw_frame(self._canvas, frames[0], f"decision {self._shown}"))
+        self.add(self._canvas, scene.step, frames)
 
 
 def film_rows(episode: Explained, path: Path, fps: int) -> None:

@@ -67,19 +67,20 @@ def policy_and_batch(data: Path, chosen: SemanticsConfig) -> tuple[Any, dict[str
     return policy, before(torch.utils.data.default_collate([dataset[2], dataset[5]]))
 
 
-def loss_and_gradients(policy: Any, batch: dict[str, Any]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def loss_and_gradients(policy: Any, batch: dict[str, Any]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     torch.manual_seed(1)
     loss, _ = policy(batch)
     loss.backward()
-    return loss, [p.grad for p in policy.parameters() if p.grad is not None]
+    return loss, {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
 
 
 def assert_same(
-    stored: tuple[torch.Tensor, list[torch.Tensor]], plain: tuple[torch.Tensor, list[torch.Tensor]]
+    stored: tuple[torch.Tensor, dict[str, torch.Tensor]], plain: tuple[torch.Tensor, dict[str, torch.Tensor]]
 ) -> None:
     torch.testing.assert_close(stored[0], plain[0])
     assert len(plain[1]) > 1
-    assert_same_gradients(stored[1], plain[1])
+    assert stored[1].keys() == plain[1].keys()
+    assert_same_gradients(list(stored[1].values()), list(plain[1].values()), list(plain[1]))
 
 
 def test_columns_are_the_vectors_of_the_images_and_the_rest_is_unchanged(root: Path, cached: Path, file: Path) -> None:

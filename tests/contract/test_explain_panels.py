@@ -26,17 +26,11 @@ from dataset_tools.overlay import CHOSEN, GAP, MUTED, TARGET, TRUTH, Scene
 from dataset_tools.page import draw_panels
 from lerobot_histmv.geometry import project
 from lerobot_histmv.model.config import HistoryConfig
-from lerobot_histmv.modeling_histmv import HistMVPolicy
 
 
 @pytest.fixture(scope="module", params=CHOOSING)
-def policy(request: pytest.FixtureRequest) -> HistMVPolicy:
-    return policy_choosing(request.param)
-
-
-@pytest.fixture(scope="module")
-def acted(policy: HistMVPolicy) -> tuple[torch.Tensor, list[Record]]:
-    return act(policy)
+def acted(request: pytest.FixtureRequest) -> tuple[torch.Tensor, list[Record]]:
+    return act(policy_choosing(request.param))
 
 
 def test_every_view_s_heat_is_drawn_where_it_peaks(acted: tuple[torch.Tensor, list[Record]]) -> None:
