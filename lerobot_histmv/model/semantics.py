@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_histmv.model.config import SemanticsConfig
+from lerobot_histmv.model.frozen_vit import quicken
 from lerobot_histmv.model.image_tower import UNREADABLE, ImageTower
 from lerobot_histmv.model.r3m import R3mTower
 
@@ -102,6 +103,8 @@ class ClipTowers(ImageTower):
         self.clip.register_buffer("logit_scale", scale)
         if config.image != "clip":
             del self.clip.visual
+        elif not self.trained:
+            quicken(self.clip.visual)
         if hasattr(self.clip, "text_decoder"):
             del self.clip.text_decoder  # CoCa's, for captions
         if config.text != "clip":

@@ -12,6 +12,7 @@ from tiny_weights import clip_file, clip_of, code_file
 
 from lerobot_histmv.model import semantics
 from lerobot_histmv.model.config import SemanticsConfig
+from lerobot_histmv.model.frozen_vit import FrozenBlocks
 from lerobot_histmv.model.semantics import Semantics
 
 CPU = torch.device("cpu")
@@ -74,6 +75,17 @@ def test_frozen_towers_neither_learn_nor_belong_to_the_checkpoint(weights_file: 
     assert not towers.text(SENTENCES, CPU).requires_grad
     assert list(towers.parameters()) == []
     assert towers.state_dict() == {}
+
+
+def test_frozen_towers_compute_what_the_plain_ones_do_with_fewer_operations(weights_file: Path) -> None:
+    quick, plain = frozen(weights_file), semantics.create_clip("tiny", str(weights_file)).eval()
+    tower = quick._image_tower[0]
+    assert tower is not None
+    assert isinstance(tower.network.transformer, FrozenBlocks)
+    torch.testing.assert_close(
+        tower.images(views()[0]), plain.encode_image(tower.prepared(views()[0]), normalize=True), atol=1e-5, rtol=0
+    )
+    assert not isinstance(trained().trained_towers["clip"].network.transformer, FrozenBlocks)
 
 
 def test_local_weights_are_the_ones_used(weights_file: Path) -> None:
