@@ -18,7 +18,7 @@ from torch.nn import functional
 Product = Callable[[Tensor], Tensor]
 
 ROWS = 150
-"""Rows for which the weights are arranged: three views of 50 tokens (ViT-B/32). Others are slower, not wrong."""
+"""Rows for which the weights are arranged, three views of 50 tokens (ViT-B/32); any other number gives the same."""
 
 
 def can_arrange(weight: Tensor) -> bool:
