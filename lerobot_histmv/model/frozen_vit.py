@@ -73,6 +73,7 @@ class FrozenBlocks(nn.Module):
         # Autocast would round all weights at every call, which takes a CPU ten times as long as the products.
         with torch.no_grad(), torch.autocast("cpu", enabled=False):
             products = self._products()
+            tokens = tokens.to(next(self.parameters()).dtype)  # patches are embedded under autocast
             for block, own in zip(self.resblocks[:-1], products[:-1], strict=True):
                 tokens = block_output(block, own, tokens, leaving=None)
             return block_output(self.resblocks[-1], products[-1], tokens, leaving=1)

@@ -29,11 +29,7 @@ def actions(policy: HistMVPolicy) -> torch.Tensor:
 
 
 KINDS = ["all", "mean", "tokens", "ranked", "frozen"]
-"""Networks in which rounding cannot make another view act.
-
-Their seeds keep the episodes away from two other edges of an untrained network, where the least rounding decides: which
-of two equal peaks is the higher, and which sign of a quaternion is the nearer.
-"""
+"""Networks in which rounding cannot make another view act."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -51,14 +47,18 @@ def test_bfloat16_keeps_the_loss_and_the_direction_of_the_gradient(kind: str, tm
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_bfloat16_moves_no_action_by_millimetres(kind: str, tmp_path: Path) -> None:
-    """Measured: 1.0 mm, and 0.009 in a quaternion's components but for "mean"'s 0.023."""
+    """Bounds are about twice what was measured, with AVX-512 and AVX2: 0.6 mm, 0.0045 in a quaternion's components.
+
+    The seed keeps all networks away from three edges of an untrained one, where the least rounding decides: which of
+    two equal peaks is the higher, which sign of a quaternion is the nearer, and whether the gripper opens.
+    """
     config = tiny_config(network=networks(tmp_path)[kind])
-    expected = actions(tiny_policy(config))
+    expected = actions(tiny_policy(config, seed=2))
     with torch.autocast("cpu", torch.bfloat16):
-        found = actions(tiny_policy(config))
+        found = actions(tiny_policy(config, seed=2))
     assert found.dtype == torch.float32
-    assert 0 < (found - expected)[:, :3].norm(dim=1).max() < 2e-3, "0 would mean that nothing was rounded"
-    torch.testing.assert_close(found[:, 3:7], expected[:, 3:7], atol=0.03 if kind == "mean" else 0.018, rtol=0)
+    assert 0 < (found - expected)[:, :3].norm(dim=1).max() < 1.2e-3, "0 would mean that nothing was rounded"
+    torch.testing.assert_close(found[:, 3:7], expected[:, 3:7], atol=0.01, rtol=0)
     assert found[:, 7].equal(expected[:, 7])
 
 

@@ -82,12 +82,15 @@ def test_precision_may_change_afterwards_and_copies_agree() -> None:
     assert copies[0].to("meta")(images().to("meta")).shape == (3, OUT)
 
 
-def test_autocast_on_a_cpu_rounds_nothing() -> None:
+def test_autocast_on_a_cpu_rounds_only_how_patches_are_embedded_and_the_vector() -> None:
     changed = quickened(tower())
     tokens = torch.randn(3, TOKENS, WIDTH)
-    expected = changed.transformer(tokens)
+    expected, vectors = changed.transformer(tokens), changed(images())
     with torch.autocast("cpu", torch.bfloat16):
         assert changed.transformer(tokens).equal(expected)
+        rounded = changed(images())
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), vectors, rtol=0.05, atol=0.1)
 
 
 @pytest.mark.parametrize(
